@@ -1,0 +1,38 @@
+"""The `lerobot-wm` command: a table of subcommands, each with its own module and `main()`."""
+
+import importlib
+import sys
+
+# name -> (module with a main() that reads sys.argv, what it does)
+COMMANDS: dict[str, tuple[str, str]] = {
+    "collect": ("lerobot_wm.pipeline.collect", "scripted-expert Meta-World demonstrations -> LeRobotDataset"),
+    "train": ("lerobot_wm.pipeline.train", "lerobot-train with its flags, fed from RAM or GPU memory"),
+    "encode": ("lerobot_wm.pipeline.encode", "image dataset + frozen world model -> latent LeRobotDataset"),
+    "eval": ("lerobot_wm.pipeline.evaluate", "lerobot-eval with its flags, one record per rollout"),
+    "report": ("lerobot_wm.report.build", "records -> success table and self-contained HTML page"),
+    "doctor": ("lerobot_wm.pipeline.doctor", "check Python, GL, packages, GPU, disk and Hub login"),
+}
+
+
+def usage() -> str:
+    """The text of `lerobot-wm --help`."""
+    lines = ["usage: lerobot-wm COMMAND [flags]    (lerobot-wm COMMAND --help lists a command's flags)", ""]
+    lines += [f"  {name:<9}{what}" for name, (_, what) in COMMANDS.items()]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the subcommand named first on the command line."""
+    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if name in ("-h", "--help"):
+        print(usage())
+        return
+    if name not in COMMANDS:
+        sys.exit(f"lerobot-wm: no command '{name}'; expected one of {', '.join(COMMANDS)}.")
+    # LeRobot's parsers read sys.argv themselves: hand the subcommand its own argument list.
+    sys.argv = [f"lerobot-wm {name}", *sys.argv[2:]]
+    importlib.import_module(COMMANDS[name][0]).main()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Names stated once: feature keys, task sets, camera and protocol numbers."""
+
+# Feature keys, equal to LeRobot's (this module imports nothing, so that nn/, world_model/ and rl/ can use it).
+OBS_IMAGE = "observation.image"
+OBS_STATE = "observation.state"
+OBS_ENV_STATE = "observation.environment_state"
+OBS_LATENT = "observation.latent"
+ACTION = "action"
+REWARD = "next.reward"
+DENSE_REWARD = "next.dense_reward"
+SUCCESS = "next.success"
+DONE = "next.done"
+TASK = "task"
+VARIATION = "variation"
+TASK_ID = "task_id"
+
+# The paper's six tasks (section 4), v3 of Meta-World, in the order of the paper's Table 1.
+MT6: tuple[str, ...] = (
+    "button-press-topdown-v3",
+    "door-open-v3",
+    "drawer-open-v3",
+    "reach-v3",
+    "window-close-v3",
+    "window-open-v3",
+)
+
+# Meta-World's MT10, in its own order.
+MT10: tuple[str, ...] = (
+    "reach-v3",
+    "push-v3",
+    "pick-place-v3",
+    "door-open-v3",
+    "drawer-open-v3",
+    "drawer-close-v3",
+    "button-press-topdown-v3",
+    "peg-insert-side-v3",
+    "window-open-v3",
+    "window-close-v3",
+)
+
+# A task set's name on the command line -> its tasks; "mt50" is every task and is resolved in envs/tasks.py.
+TASK_SETS: dict[str, tuple[str, ...]] = {"mt6": MT6, "mt10": MT10}
+
+ENV_TYPE = "metaworld_mt"
+NUM_VARIATIONS = 50
+NUM_SEEN_VARIATIONS = 10  # variations 0-9 are collected on, 10-49 are never seen in training
+MAX_EPISODE_STEPS = 500
+FPS = 80  # one environment step is 0.0125 s of simulated time
+ACTION_DIM = 4  # x, y, z, gripper, each in [-1, 1]
+STATE_DIM = 4  # Cartesian end effector (m) and gripper opening
+ENV_STATE_DIM = 39
+IMAGE_SIZE = 64
+ROBOT_TYPE = "metaworld"
+
+# LeRobot's adjusted corner2: it shows every task's objects. Its images arrive flipped on both axes.
+CAMERA_NAME = "corner2"
+CAMERA_POSITION = (0.75, 0.075, 0.7)

@@ -1,0 +1,119 @@
+"""Camera frames decoded once into uint8 and memory-mapped from a file beside the dataset."""
+
+import logging
+import os
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import decode_video_frames
+from numpy.lib.format import open_memmap
+from torch import Tensor
+from tqdm import tqdm
+
+from lerobot_wm.data.fingerprint import dataset_fingerprint
+
+logger = logging.getLogger(__name__)
+
+CACHE_VARIABLE = "LEROBOT_WM_CACHE"
+
+
+def cache_root(dataset_root: Path) -> Path:
+    """Where what is derived from a dataset lives: `<root>.cache` beside it, or under $LEROBOT_WM_CACHE.
+
+    The folder can be deleted at any time; it is made again when needed.
+
+    Raises:
+        PermissionError: The place cannot be written.
+    """
+    place = os.environ.get(CACHE_VARIABLE)
+    root = Path(place) / dataset_root.name if place else dataset_root.with_name(f"{dataset_root.name}.cache")
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PermissionError(
+            f"Cannot write the decoded frames to {root} ({error.strerror}): "
+            f"set {CACHE_VARIABLE} to a folder with room for them."
+        ) from error
+    return root
+
+
+class CameraCache:
+    """One camera's frames for the whole dataset, (N, H, W, C) uint8 in order of the absolute frame index.
+
+    Episodes are decoded on first use, and each is marked when its frames are on disk: an interrupted decoding
+    goes on where it stopped, and a dataset opened for some episodes decodes only those.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, key: str, folder: Path) -> None:
+        self._dataset = dataset
+        self._key = key
+        height, width, channels = self._frame_shape()
+        shape = (dataset.meta.total_frames, height, width, channels)
+        self._frames = self._open(folder / f"{key}.npy", shape)
+        self._decoded = self._open(folder / f"{key}.decoded.npy", (dataset.meta.total_episodes,))
+
+    @property
+    def frames(self) -> np.ndarray:
+        """The memory map, (N, H, W, C) uint8; only episodes that were asked for hold frames."""
+        return self._frames
+
+    def ensure(self, episodes: Iterable[int]) -> None:
+        """Decode the episodes that are not in the cache yet, on all cores."""
+        missing = [episode for episode in episodes if not self._decoded[episode]]
+        if not missing:
+            return
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            done = pool.map(self._decode, missing)
+            list(tqdm(done, total=len(missing), desc=f"Decoding {self._key}", unit="episode", leave=False))
+
+    def _decode(self, episode: int) -> None:
+        meta = self._dataset.meta
+        row = meta.episodes[episode]
+        start, stop = row["dataset_from_index"], row["dataset_to_index"]
+        if self._key in meta.video_keys:
+            # LeRobot's own decoder, asked for a whole episode at once: equal frames, one seek.
+            first = row[f"videos/{self._key}/from_timestamp"]
+            images = decode_video_frames(
+                self._dataset.root / meta.get_video_file_path(episode, self._key),
+                [first + i / meta.fps for i in range(stop - start)],
+                tolerance_s=1 / (4 * meta.fps),
+                return_uint8=True,
+            )  # (T, C, H, W)
+        else:
+            relative = self._dataset.absolute_to_relative_idx
+            first = start if relative is None else relative[start]
+            rows = self._dataset.hf_dataset[first : first + stop - start][self._key]
+            images = (torch.stack(rows) * 255).round().to(torch.uint8)  # (T, C, H, W)
+        self._frames[start:stop] = images.permute(0, 2, 3, 1).numpy()
+        self._frames.flush()
+        self._decoded[episode] = 1
+
+    def _frame_shape(self) -> tuple[int, int, int]:
+        feature = self._dataset.meta.features[self._key]
+        shape = tuple(feature["shape"])
+        return shape if feature["names"][2].startswith("channel") else (*shape[1:], shape[0])
+
+    @staticmethod
+    def _open(path: Path, shape: tuple[int, ...]) -> np.memmap:
+        if path.is_file():
+            return open_memmap(path, mode="r+")
+        partial = path.with_suffix(f".{os.getpid()}.tmp")
+        open_memmap(partial, mode="w+", dtype=np.uint8, shape=shape).flush()
+        partial.replace(path)
+        return open_memmap(path, mode="r+")
+
+
+def camera_frames(dataset: LeRobotDataset, key: str) -> Tensor:
+    """A camera's decoded frames, (N, H, W, C) uint8 by absolute index, memory-mapped.
+
+    Frames of episodes outside `dataset.episodes` are zero unless an earlier call decoded them.
+    """
+    folder = cache_root(Path(dataset.root)) / f"frames-{dataset_fingerprint(Path(dataset.root))}"
+    folder.mkdir(exist_ok=True)
+    cache = CameraCache(dataset, key, folder)
+    cache.ensure(range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes)
+    return torch.from_numpy(cache.frames)

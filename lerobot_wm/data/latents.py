@@ -1,0 +1,58 @@
+"""The record a latent dataset carries: which world model and which dataset it was made from."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+RECORD_PATH = "meta/latents.json"
+
+
+@dataclass(frozen=True)
+class LatentRecord:
+    """Provenance of a latent dataset, kept in its `meta/latents.json`.
+
+    Attributes:
+        world_model_fingerprint: `weights_fingerprint` of the encoding world model.
+        source_repo_id: The dataset that was encoded.
+        source_fingerprint: `dataset_fingerprint` of it.
+        tasks: Its task strings, in order of task_index.
+        sampled: False where z_t is the posterior mean, True where it is a sample.
+    """
+
+    world_model_fingerprint: str
+    source_repo_id: str
+    source_fingerprint: str
+    tasks: list[str]
+    sampled: bool
+
+    def write(self, root: Path) -> None:
+        """Write the record into the dataset at `root`."""
+        (root / RECORD_PATH).write_text(json.dumps(asdict(self), indent=2) + "\n")
+
+    @classmethod
+    def read(cls, root: Path) -> "LatentRecord":
+        """Read the record of the dataset at `root`.
+
+        Raises:
+            ValueError: The dataset carries none.
+        """
+        path = root / RECORD_PATH
+        if not path.is_file():
+            raise ValueError(
+                f"{path} is missing, so nothing tells which world model these latents are of: "
+                "encode the dataset again with `lerobot-wm encode`."
+            )
+        return cls(**json.loads(path.read_text()))
+
+    def check_world_model(self, fingerprint: str, path: str) -> None:
+        """Refuse latents of another world model.
+
+        Raises:
+            ValueError: The fingerprints differ.
+        """
+        if self.world_model_fingerprint != fingerprint:
+            raise ValueError(
+                f"These latents were encoded by world model {self.world_model_fingerprint}, but {path} is world model "
+                f"{fingerprint}. A policy would act on states it was never trained on: encode {self.source_repo_id} "
+                "with this world model, or pass the world model the latents are of."
+            )

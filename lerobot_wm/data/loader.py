@@ -1,0 +1,132 @@
+"""Batches equal to LeRobot's DataLoader, gathered from RAM or GPU memory."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch import Tensor
+from torch.utils.data import DataLoader, Subset
+
+from lerobot_wm.data.cache import camera_frames
+from lerobot_wm.data.tables import column_tensor
+
+_GPU_SHARE = 0.6  # of the free GPU memory may be taken by resident frames; activations need the rest
+
+
+def gather(source: Tensor, index: Tensor) -> Tensor:
+    """source[index] for index (B,) or (B, T).
+
+    On a CPU, rows of consecutive indices are copied as one slice each: four times faster than fancy indexing.
+    """
+    if index.ndim == 1 or source.is_cuda or not bool((index.diff(dim=1) == 1).all()):
+        return source[index]
+    batch, length = index.shape
+    out = source.new_empty(batch, length, *source.shape[1:])
+    for row, start in zip(out, index[:, 0].tolist(), strict=True):
+        row.copy_(source[start : start + length])
+    return out
+
+
+class RamDataset:
+    """A LeRobotDataset's columns and decoded frames as tensors, indexed as the dataset is.
+
+    Args:
+        dataset: The dataset, with the delta indices it was opened with.
+        device: Frames are kept here when they fit, else in a memory map; the columns always are.
+
+    Raises:
+        ValueError: The dataset applies image transforms, which decoded frames do not go through.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, device: torch.device) -> None:
+        if dataset.reader._image_transforms is not None:
+            raise ValueError(
+                "--dataset.image_transforms.enable=true has no effect on frames served from RAM: "
+                "turn it off, or train with lerobot-train."
+            )
+        self.device = device
+        meta = dataset.meta
+        self._tasks = [str(task) for task in meta.tasks.index]
+        self._deltas: dict[str, list[int]] = dataset.reader.delta_indices or {}
+        features = {key: tuple(feature["shape"]) for key, feature in meta.features.items()}
+        self._columns = {
+            key: column_tensor(dataset.hf_dataset, key, shape).to(device)
+            for key, shape in features.items()
+            if key not in meta.camera_keys
+        }
+        # PNG frames leave LeRobot's loader as float32, video frames as uint8 for the training loop to convert.
+        self._float_cameras = set(meta.image_keys)
+        self._cameras = {key: self._resident(camera_frames(dataset, key)) for key in meta.camera_keys}
+
+        episode = self._columns["episode_index"]
+        starts = torch.searchsorted(episode, episode)  # rows of an episode are consecutive
+        stops = torch.searchsorted(episode, episode, right=True)
+        self._first, self._last = starts, stops - 1  # (N,) per row: first and last row of its episode
+        self._to_absolute = self._columns["index"] - torch.arange(len(episode), device=device)  # (N,)
+
+    def batch(self, rows: list[int]) -> dict[str, Any]:
+        """The collated batch of these dataset indices: the keys, shapes, types and values of LeRobot's."""
+        index = torch.tensor(rows, device=self.device)  # (B,)
+        windows: dict[tuple[int, ...], tuple[Tensor, Tensor]] = {}
+        out: dict[str, Any] = {}
+        for key in (*self._columns, *self._cameras):
+            window, is_pad = index, None
+            if key in self._deltas:
+                deltas = tuple(self._deltas[key])
+                if deltas not in windows:
+                    windows[deltas] = self._window(index, deltas)
+                window, is_pad = windows[deltas]
+            if is_pad is not None:
+                out[f"{key}_is_pad"] = is_pad
+            out[key] = (
+                self._images(key, window) if key in self._cameras else gather(self._columns[key], window)
+            )
+        out["task"] = [self._tasks[i] for i in out["task_index"].tolist()]
+        return out
+
+    def _window(self, index: Tensor, deltas: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        """Rows (B, T) around each index, clamped to its episode, and where they were clamped (B, T)."""
+        wanted = index[:, None] + torch.tensor(deltas, device=self.device)
+        clamped = wanted.clamp(self._first[index][:, None], self._last[index][:, None])
+        return clamped, wanted != clamped
+
+    def _images(self, key: str, rows: Tensor) -> Tensor:
+        """Frames (B, C, H, W) or (B, T, C, H, W): a channels-first view of channels-last memory."""
+        frames = self._cameras[key]
+        images = gather(frames, (rows + self._to_absolute[rows]).to(frames.device)).to(self.device)
+        images = images.movedim(-1, -3)
+        return images.float() / 255 if key in self._float_cameras else images
+
+    def _resident(self, frames: Tensor) -> Tensor:
+        if self.device.type != "cuda":
+            return frames
+        free, _ = torch.cuda.mem_get_info(self.device)
+        return frames.to(self.device) if frames.numel() < _GPU_SHARE * free else frames
+
+
+class RamLoader:
+    """Stands in for a DataLoader: the same batches in the same order, without its workers and copies.
+
+    Args:
+        data_loader: The loader LeRobot built; its batch sampler gives the order, its dataset the frames.
+        batch_sampler: What to iterate in its place, e.g. this process's share of it.
+        device: Where batches are put.
+    """
+
+    def __init__(
+        self, data_loader: DataLoader, batch_sampler: Iterable[list[int]], device: torch.device
+    ) -> None:
+        dataset: Any = data_loader.dataset
+        self._subset: Sequence[int] | None = None
+        if isinstance(dataset, Subset):  # LeRobot's --max_eval_samples
+            dataset, self._subset = dataset.dataset, dataset.indices
+        self._batch_sampler = batch_sampler
+        self._source = RamDataset(dataset, device)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for rows in self._batch_sampler:
+            yield self._source.batch(rows if self._subset is None else [self._subset[i] for i in rows])
+
+    def __len__(self) -> int:
+        return len(self._batch_sampler)  # type: ignore[arg-type]

@@ -1,0 +1,131 @@
+"""LeRobot's view of the environment: `--env.type=metaworld_mt`."""
+
+import difflib
+import logging
+import multiprocessing
+import os
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+
+from lerobot_wm.constants import (
+    ACTION_DIM,
+    CAMERA_NAME,
+    ENV_TYPE,
+    FPS,
+    IMAGE_SIZE,
+    MAX_EPISODE_STEPS,
+    STATE_DIM,
+)
+from lerobot_wm.envs.tasks import resolve_tasks
+from lerobot_wm.envs.variations import split_variations
+
+CAMERAS = ("corner2", "corner", "corner3", "topview", "behindGripper", "gripperPOV")
+
+
+@EnvConfig.register_subclass(ENV_TYPE)
+@dataclass
+class MetaworldMTEnvConfig(EnvConfig):
+    """Meta-World tasks, each with 50 fixed variations; `reset(seed=k)` is variation k of the split.
+
+    Args:
+        task: a task, a set (mt6, mt10, mt50) or a comma-separated list.
+        split: "all" (variations 0-49), "seen" (0-9) or "unseen" (10-49).
+        image_size: height and width of the image in pixels.
+        camera_name: one of the model's cameras.
+        fast_rendering: leave out shadows, reflections and multisampling.
+        episode_length: steps until truncation, at most 500.
+        obs_type: "pixels_agent_pos", the only kind.
+    """
+
+    task: str = "mt6"
+    fps: int = FPS
+    split: str = "all"
+    image_size: int = IMAGE_SIZE
+    camera_name: str = CAMERA_NAME
+    fast_rendering: bool = True
+    episode_length: int = MAX_EPISODE_STEPS
+    obs_type: str = "pixels_agent_pos"
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {
+            "action": PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,)),
+        }
+    )
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {"action": ACTION, "agent_pos": OBS_STATE, "pixels": OBS_IMAGE}
+    )
+
+    def __post_init__(self) -> None:
+        """Check every field and state the image's shape (height, width, channels)."""
+        resolve_tasks(self.task)
+        split_variations(self.split)
+        if self.obs_type != "pixels_agent_pos":
+            raise ValueError(f"obs_type is '{self.obs_type}'; this environment has only 'pixels_agent_pos'.")
+        if self.image_size < 16:
+            raise ValueError(f"image_size is {self.image_size}; expected at least 16 pixels.")
+        if not 1 <= self.episode_length <= MAX_EPISODE_STEPS:
+            raise ValueError(f"episode_length is {self.episode_length}; expected 1 to {MAX_EPISODE_STEPS}.")
+        if self.camera_name not in CAMERAS:
+            close = difflib.get_close_matches(self.camera_name, CAMERAS, n=1)
+            hint = f" (did you mean {close[0]}?)" if close else ""
+            raise ValueError(f"Unknown camera '{self.camera_name}'{hint}; expected {', '.join(CAMERAS)}.")
+        shape = (self.image_size, self.image_size, 3)
+        self.features["pixels"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `MetaworldMTEnv` besides its task."""
+        return {
+            "split": self.split,
+            "image_size": self.image_size,
+            "camera_name": self.camera_name,
+            "fast_rendering": self.fast_rendering,
+            "episode_length": self.episode_length,
+        }
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """{task name: {0: vector environment of n_envs}}: LeRobot then reports success per task.
+
+        A sub-environment whose episode is over is neither simulated nor drawn again until the next rollout.
+        """
+        from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+
+        from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
+
+        envs: dict[str, dict[int, Any]] = {}
+        for task in resolve_tasks(self.task):
+            env_fns = [partial(MetaworldMTEnv, task, **self.gym_kwargs) for _ in range(n_envs)]
+            if use_async_envs and n_envs > 1:
+                envs[task] = {0: _LazyAsyncVectorEnv(env_fns)}
+            else:
+                envs[task] = {
+                    0: gym.vector.SyncVectorEnv(
+                        [freeze_after_episode_end(env_fn) for env_fn in env_fns],
+                        autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP,
+                    )
+                }
+        if use_async_envs and n_envs > 1:
+            self._prepare_workers(n_envs)
+        return envs
+
+    @staticmethod
+    def _prepare_workers(n_envs: int) -> None:
+        # Workers are forked from a server that has imported torch and mujoco once, not once per worker.
+        multiprocessing.get_context("forkserver").set_forkserver_preload(
+            ["__main__", "lerobot.envs.utils", "metaworld", "lerobot_wm.envs.metaworld_mt"]
+        )
+        cores = os.cpu_count() or 1
+        if n_envs > cores:
+            logging.warning(
+                "%d environment processes share %d cores: --eval.use_async_envs=false is likely faster.",
+                n_envs,
+                cores,
+            )

@@ -1,0 +1,141 @@
+"""A Meta-World task with its 50 fixed variations as a gymnasium environment."""
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_wm.constants import (
+    ACTION_DIM,
+    CAMERA_NAME,
+    FPS,
+    IMAGE_SIZE,
+    MAX_EPISODE_STEPS,
+    STATE_DIM,
+)
+from lerobot_wm.envs.rendering import Renderer, RenderKey
+from lerobot_wm.envs.tasks import task_description
+from lerobot_wm.envs.variations import split_variations
+
+if TYPE_CHECKING:
+    from lerobot_wm.envs.simulation import Simulation
+
+Observation = dict[str, np.ndarray]
+
+
+class MetaworldMTEnv(gym.Env):
+    """One Meta-World v3 task; `reset(seed=k)` restores fixed variation k of its split, bit for bit.
+
+    Observation: `pixels` uint8 (image_size, image_size, 3) RGB and `agent_pos` float32 (4,): the end
+    effector's position (m) and the gripper's opening (0 to 1). Action: float32 (4,) in [-1, 1], moving the
+    end effector by up to 1 cm per axis, and the gripper's effort. Reward: 1 on a step that ends in success,
+    else 0. `info` holds `is_success`, `variation` and, after a step, `dense_reward` (Meta-World's shaped
+    reward, 0 to 10). The simulator is built at the first reset, so that many environments can be made cheaply.
+
+    Args:
+        task: a Meta-World v3 task, such as "reach-v3".
+        split: "all", "seen" (variations 0-9) or "unseen" (10-49).
+        image_size: height and width of the image in pixels.
+        camera_name: one of the model's cameras; "corner2" is moved to where every task is in view.
+        fast_rendering: leave out shadows, reflections and multisampling.
+        episode_length: steps until truncation, at most 500.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (gymnasium's interface)
+    render_mode = "rgb_array"
+
+    def __init__(
+        self,
+        task: str,
+        split: str = "all",
+        image_size: int = IMAGE_SIZE,
+        camera_name: str = CAMERA_NAME,
+        fast_rendering: bool = True,
+        episode_length: int = MAX_EPISODE_STEPS,
+    ) -> None:
+        self.task = task
+        self.task_description = task_description(task)
+        self._max_episode_steps = episode_length  # the name LeRobot's rollout reads
+        self._variations = split_variations(split)
+        self._render_key = RenderKey(task, camera_name, image_size, fast_rendering)
+        self.observation_space = gym.spaces.Dict(
+            {
+                "pixels": gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
+                "agent_pos": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
+            }
+        )
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+        self._sim: Simulation | None = None
+        self._renderer: Renderer | None = None
+        self._next_index = 0
+        self._steps = 0
+        self.variation = -1
+        self._state = np.zeros(0)
+        self._image = np.zeros((image_size, image_size, 3), np.uint8)
+
+    @property
+    def environment_state(self) -> np.ndarray:
+        """Meta-World's full state, float64 (39,): hand and objects now, one step ago, and the goal."""
+        return self._state.copy()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start a variation: number `seed` of the split, modulo their number; without a seed the next one."""
+        super().reset(seed=seed)
+        if self._sim is None:
+            self._build()
+        assert self._sim is not None
+        index = self._next_index if seed is None else seed
+        self._next_index = index + 1
+        self.variation = self._variations[index % len(self._variations)]
+        self._steps = 0
+        self._state = self._sim.reset(self.variation)
+        return self._observe(), {"is_success": False, "variation": self.variation}
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Execute one action for 0.0125 s.
+
+        Raises:
+            ValueError: if the action has another shape or a value that is not finite.
+        """
+        action = np.asarray(action, dtype=np.float32)
+        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
+            raise ValueError(
+                f"{self.task}, variation {self.variation}, step {self._steps}: expected an action of "
+                f"{ACTION_DIM} finite numbers, found {action.tolist()}."
+            )
+        if self._sim is None:
+            raise RuntimeError(f"{self.task}: call reset() before step().")
+        outcome = self._sim.step(np.clip(action, -1.0, 1.0))
+        self._steps += 1
+        self._state = outcome.state
+        info = {
+            "is_success": outcome.success,
+            "variation": self.variation,
+            "dense_reward": outcome.dense_reward,
+        }
+        truncated = self._steps >= self._max_episode_steps
+        return self._observe(), float(outcome.success), outcome.success, truncated, info
+
+    def render(self) -> np.ndarray:
+        """The current observation's image, uint8 (image_size, image_size, 3)."""
+        return self._image
+
+    def close(self) -> None:
+        """Free the simulator and its OpenGL memory; a later reset builds them again."""
+        if self._sim is not None:
+            Renderer.release(self._render_key)
+            self._sim = self._renderer = None
+
+    def _build(self) -> None:
+        from lerobot_wm.envs.simulation import Simulation
+
+        self._sim = Simulation(self.task)
+        self._renderer = Renderer.acquire(self._render_key, self._sim.model)
+
+    def _observe(self) -> Observation:
+        assert self._sim is not None
+        assert self._renderer is not None
+        self._image = self._renderer.render(self._sim.model, self._sim.data)
+        return {"pixels": self._image, "agent_pos": self._state[:STATE_DIM].astype(np.float32)}

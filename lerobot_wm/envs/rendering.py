@@ -1,0 +1,139 @@
+"""Fast offscreen rendering of MuJoCo models.
+
+Shadow maps, multisampling and reflections take nine tenths of Meta-World's drawing time at small sizes and
+carry no information a policy needs: they are off by default. All OpenGL calls of a process are made by one
+thread with one context. A context is bound to its thread while LeRobot may evaluate tasks in several
+(`--env.max_parallel_tasks`), and two contexts in one thread draw into each other's images unless switched.
+"""
+
+import atexit
+import importlib
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lerobot_wm.constants import CAMERA_NAME
+
+if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco reads it when it is first imported
+
+GL_HELP = (
+    "No headless OpenGL to draw with (MUJOCO_GL={backend}). On Debian or Ubuntu run\n"
+    "    apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri\n"
+    "and use MUJOCO_GL=egl (the default without a display)."
+)
+MAX_GEOMS = 1000  # of a scene; Meta-World's largest has about 100
+
+
+class RenderKey(NamedTuple):
+    """What environments must have in common to share a renderer: the same meshes, drawn the same way."""
+
+    task: str
+    camera_name: str
+    size: int
+    fast: bool
+
+
+_gl_thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="mujoco-gl")
+_gl_context: Any = None
+_renderers: dict[RenderKey, "Renderer"] = {}
+
+
+class Renderer:
+    """A task's meshes and textures in OpenGL, shared by all sub-environments of that task.
+
+    Get one with `acquire` and give it back with `release`; creating one takes 0.1-0.4 s.
+    """
+
+    def __init__(self, key: RenderKey, model: Any) -> None:
+        import mujoco
+
+        self.users = 0
+        self._upside_down = key.camera_name == CAMERA_NAME
+        _ensure_gl_context()
+        model.vis.global_.offwidth = model.vis.global_.offheight = key.size
+        if key.fast:
+            model.vis.quality.offsamples = 0
+            model.vis.quality.shadowsize = 0
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
+        if key.fast:
+            self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+            self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = model.camera(key.camera_name).id
+        self._options = mujoco.MjvOption()
+        self._viewport = mujoco.MjrRect(0, 0, key.size, key.size)
+
+    @staticmethod
+    def acquire(key: RenderKey, model: Any) -> "Renderer":
+        """The process's renderer for `key`, created from `model` (mujoco.MjModel) on first use."""
+        return _gl_thread.submit(_acquire, key, model).result()
+
+    @staticmethod
+    def release(key: RenderKey) -> None:
+        """Give back a renderer; the last user frees its OpenGL memory."""
+        _gl_thread.submit(_release, key).result()
+
+    def render(self, model: Any, data: Any) -> np.ndarray:
+        """Draw a state (mujoco.MjModel, mujoco.MjData) as an upright uint8 RGB image (size, size, 3)."""
+        return _gl_thread.submit(self._render, model, data).result()
+
+    def _render(self, model: Any, data: Any) -> np.ndarray:
+        import mujoco
+
+        image = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
+        # Every task's renderer has its own framebuffer in the one context: select ours.
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, self._options, None, self._camera, everything, self._scene)
+        mujoco.mjr_render(self._viewport, self._scene, self._context)
+        mujoco.mjr_readPixels(image, None, self._viewport, self._context)
+        # OpenGL's rows run upwards: reversing them makes the image upright. corner2 is mounted upside down and
+        # needs both axes reversed on top, which leaves the columns.
+        return np.ascontiguousarray(image[:, ::-1] if self._upside_down else image[::-1])
+
+
+def _acquire(key: RenderKey, model: Any) -> Renderer:
+    if key not in _renderers:
+        _renderers[key] = Renderer(key, model)
+    _renderers[key].users += 1
+    return _renderers[key]
+
+
+def _release(key: RenderKey) -> None:
+    _renderers[key].users -= 1
+    if _renderers[key].users == 0:
+        _renderers.pop(key)._context.free()
+
+
+def _ensure_gl_context() -> None:
+    """Make the process's OpenGL context.
+
+    Raises:
+        RuntimeError: if this machine has no working headless OpenGL, with the packages to install.
+    """
+    global _gl_context
+    if _gl_context is not None:
+        return
+    backend = os.environ.get("MUJOCO_GL", "")
+    module = f"mujoco.{backend}" if backend in ("egl", "osmesa", "glfw") else "mujoco.gl_context"
+    try:
+        context = importlib.import_module(module).GLContext(1, 1)  # its size is unused: we draw offscreen
+        context.make_current()
+    except (ImportError, AttributeError, RuntimeError, OSError) as error:
+        # PyOpenGL reports a missing library as an AttributeError on None.
+        raise RuntimeError(GL_HELP.format(backend=backend or "unset")) from error
+    _gl_context = context
+    atexit.register(_free_gl)  # runs before the display is terminated, else OpenGL complains at exit
+
+
+def _free_gl() -> None:
+    for renderer in _renderers.values():
+        renderer._context.free()
+    _renderers.clear()
+    _gl_context.free()

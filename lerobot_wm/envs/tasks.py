@@ -1,0 +1,74 @@
+"""Meta-World task names: task sets, LeRobot's task strings, ids and scripted experts."""
+
+import difflib
+import functools
+import json
+from collections.abc import Iterable
+from importlib import resources
+from typing import TypedDict
+
+from lerobot_wm.constants import TASK_SETS
+
+
+class _TaskTables(TypedDict):
+    TASK_DESCRIPTIONS: dict[str, str]
+    TASK_NAME_TO_ID: dict[str, int]
+    TASK_POLICY_MAPPING: dict[str, str]
+
+
+@functools.cache
+def _tables() -> _TaskTables:
+    # Read as data: importing lerobot.envs.metaworld would import mujoco and every expert.
+    return json.loads(resources.files("lerobot").joinpath("envs", "metaworld_config.json").read_text())
+
+
+@functools.cache
+def all_tasks() -> tuple[str, ...]:
+    """All 50 Meta-World v3 task names, in the order of LeRobot's task ids."""
+    ids = _tables()["TASK_NAME_TO_ID"]
+    return tuple(sorted(ids, key=ids.__getitem__))
+
+
+def resolve_tasks(spec: str) -> tuple[str, ...]:
+    """Turn a task argument into task names.
+
+    Args:
+        spec: a task (`reach-v3`), a set (`mt6`, `mt10`, `mt50`) or a comma-separated list of either.
+
+    Returns:
+        Task names in the order given, each once.
+
+    Raises:
+        ValueError: for an empty argument or an unknown name, with the closest names that exist.
+    """
+    task_sets = {**TASK_SETS, "mt50": all_tasks()}
+    names = [name.strip() for name in spec.split(",") if name.strip()]
+    if not names:
+        raise ValueError(f"No task in '{spec}': give a task such as reach-v3, a list, or {_or(task_sets)}.")
+    tasks: dict[str, None] = {}  # an ordered set
+    for name in names:
+        if name not in task_sets and name not in all_tasks():
+            close = difflib.get_close_matches(name, [*all_tasks(), *task_sets], n=3, cutoff=0.5)
+            hint = f"did you mean {_or(close)}?" if close else f"tasks are {', '.join(all_tasks())}."
+            raise ValueError(f"Unknown Meta-World task '{name}' (task sets: {_or(task_sets)}); {hint}")
+        tasks.update(dict.fromkeys(task_sets.get(name, (name,))))
+    return tuple(tasks)
+
+
+def task_description(task: str) -> str:
+    """The sentence LeRobot gives a task; push-v3 and push-back-v3 share theirs, all others are distinct."""
+    return _tables()["TASK_DESCRIPTIONS"][task]
+
+
+def task_id(task: str) -> int:
+    """LeRobot's number of a task, 0 to 49."""
+    return _tables()["TASK_NAME_TO_ID"][task]
+
+
+def expert_name(task: str) -> str:
+    """Name of the class in `metaworld.policies` that solves a task by script."""
+    return _tables()["TASK_POLICY_MAPPING"][task]
+
+
+def _or(names: Iterable[str]) -> str:
+    return " or ".join(names)

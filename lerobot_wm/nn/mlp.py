@@ -1,0 +1,53 @@
+"""Multi-layer perceptrons."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class MLP(nn.Module):
+    """Hidden layers with an activation (and dropout) after each, then a linear output layer.
+
+    The output layer runs in float32 even under autocast: the heads built on it (means, log-stds, values,
+    rewards) are compared with targets whose differences are smaller than bfloat16 can hold.
+
+    Args:
+        input_dim: Size of the last axis of the input.
+        hidden_dims: Width of each hidden layer.
+        output_dim: Size of the last axis of the output.
+        activation: Module class put after every hidden layer.
+        dropout: Probability of zeroing a hidden unit during training; 0 adds no dropout layer.
+    """
+
+    def __init__(
+        self,
+        input_dim: int,
+        hidden_dims: Sequence[int],
+        output_dim: int,
+        activation: type[nn.Module] = nn.ELU,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for hidden_dim in hidden_dims:
+            layers += [nn.Linear(input_dim, hidden_dim), activation()]
+            if dropout > 0:
+                layers.append(nn.Dropout(dropout))
+            input_dim = hidden_dim
+        self.trunk = nn.Sequential(*layers)
+        self.head = nn.Linear(input_dim, output_dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (..., input_dim) to float32 (..., output_dim)."""
+        hidden = self.trunk(x)  # (..., hidden_dims[-1])
+        with torch.autocast(x.device.type, enabled=False):
+            return self.head(hidden.float())
+
+
+def orthogonal_init(module: nn.Module) -> None:
+    """Orthogonal weights with gain √2 and zero biases for every linear layer (IQL reference, Kostrikov 2021)."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.orthogonal_(layer.weight, gain=2**0.5)
+            nn.init.zeros_(layer.bias)

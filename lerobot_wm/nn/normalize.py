@@ -1,0 +1,46 @@
+"""Affine scalings stored as buffers, so that a checkpoint carries the statistics it was trained with."""
+
+import torch
+from torch import Tensor, nn
+
+_EPS = 1e-6
+
+
+class Affine(nn.Module):
+    """x -> (x - offset) / scale per feature, and back.
+
+    Entries whose scale is (nearly) zero are constant in the data: they are only shifted, never blown up.
+    """
+
+    offset: Tensor
+    scale: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("offset", torch.zeros(dim))
+        self.register_buffer("scale", torch.ones(dim))
+
+    def set_standard(self, mean: Tensor, std: Tensor) -> None:
+        """Scale to zero mean and unit standard deviation; mean and std are (dim,)."""
+        self._set(mean, std)
+
+    def set_range(self, low: Tensor, high: Tensor) -> None:
+        """Scale [low, high] to [-1, 1]; low and high are (dim,)."""
+        self._set((low + high) / 2, (high - low) / 2)
+
+    def _set(self, offset: Tensor, scale: Tensor) -> None:
+        if offset.shape != self.offset.shape:
+            raise ValueError(
+                f"The dataset's statistics have {tuple(offset.shape)} entries, the model expects "
+                f"{tuple(self.offset.shape)}: recompute the statistics or use the dataset the model was made for."
+            )
+        self.offset.copy_(offset)
+        self.scale.copy_(torch.where(scale > _EPS, scale, torch.ones_like(scale)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise (..., dim)."""
+        return (x - self.offset) / self.scale
+
+    def inverse(self, x: Tensor) -> Tensor:
+        """Undo `forward` on (..., dim)."""
+        return x * self.scale + self.offset

@@ -1,0 +1,173 @@
+"""The unit of work of a collection: a shard of a few episodes, its own finished LeRobotDataset.
+
+Which episodes a shard holds is a function of the configuration alone, and an episode's noise of its task,
+variation, number and attempt. So neither the number of workers nor an interruption changes the result.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wm.constants import CAMERA_NAME, FPS, MAX_EPISODE_STEPS, ROBOT_TYPE
+from lerobot_wm.data.schema import metaworld_features
+from lerobot_wm.envs.rendering import Renderer, RenderKey
+from lerobot_wm.envs.simulation import Simulation
+from lerobot_wm.envs.tasks import task_id
+from lerobot_wm.pipeline.collect_episode import Demonstration, dataset_frames, demonstrate
+
+SHARD_EPISODES = 13  # some ten seconds of work: what a killed worker has to redo
+SHARD_RECORD = "shard.json"
+TEMPORARY_PREFIX = "unfinished-"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Episodes `first` to `first + count - 1` of a task, and all that making them depends on."""
+
+    task: str
+    first: int
+    count: int
+    variations: tuple[int, ...]
+    noise: float
+    steps_after_success: int
+    max_attempts: int
+    seed: int
+    image_size: int
+
+    @property
+    def name(self) -> str:
+        """Folder name."""
+        return f"{self.task}-{self.first:05d}"
+
+
+@dataclass
+class EpisodeRecord:
+    """How an episode came about.
+
+    Args:
+        task: its task.
+        episode: its number within the task.
+        variation: the one it was collected on.
+        moved: whether that is another than planned, the expert having failed there.
+        attempt: failures on this variation before it.
+        seed: entropy of the noise's np.random.SeedSequence.
+        length: frames.
+    """
+
+    task: str
+    episode: int
+    variation: int
+    moved: bool
+    attempt: int
+    seed: list[int]
+    length: int
+
+
+@dataclass
+class ShardRecord:
+    """A finished shard's episodes, its failed attempts per variation, and its wall time in seconds."""
+
+    episodes: list[EpisodeRecord]
+    failures: dict[int, int]
+    seconds: float
+
+    @classmethod
+    def load(cls, folder: Path) -> "ShardRecord":
+        """Read the record that lies in a finished shard."""
+        data = json.loads((folder / SHARD_RECORD).read_text())
+        return cls(
+            episodes=[EpisodeRecord(**episode) for episode in data["episodes"]],
+            failures={int(variation): count for variation, count in data["failures"].items()},
+            seconds=data["seconds"],
+        )
+
+
+def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> None:
+    """Collect a shard into `folder / shard.name`; the folder appears only when it is complete.
+
+    Args:
+        shard: what to collect.
+        folder: where shards lie.
+        on_episode: called after each finished episode.
+
+    Raises:
+        RuntimeError: if the expert fails an episode on every variation, `max_attempts` times each.
+    """
+    start = time.monotonic()
+    temporary = folder / f"{TEMPORARY_PREFIX}{os.getpid()}-{shard.name}"
+    dataset = _create_dataset(temporary, shard)
+    simulation = Simulation(shard.task)
+    render_key = RenderKey(shard.task, CAMERA_NAME, shard.image_size, fast=True)
+    renderer = Renderer.acquire(render_key, simulation.model)
+    record = ShardRecord(episodes=[], failures={}, seconds=0.0)
+    for episode in range(shard.first, shard.first + shard.count):
+        demonstration = _succeed(shard, episode, simulation, record)
+        for frame in dataset_frames(demonstration, simulation, renderer):
+            dataset.add_frame(frame)
+        dataset.save_episode()
+        on_episode()
+    dataset.finalize()
+    Renderer.release(render_key)
+    record.seconds = time.monotonic() - start
+    (temporary / SHARD_RECORD).write_text(json.dumps(asdict(record)))
+    temporary.rename(folder / shard.name)
+
+
+def _succeed(shard: Shard, episode: int, simulation: Simulation, record: ShardRecord) -> Demonstration:
+    """Try the episode's variation until it succeeds, then the next one, and so on; note what happened."""
+    n = len(shard.variations)
+    order = [shard.variations[(episode + offset) % n] for offset in range(n)]
+    for variation in order:
+        for attempt in range(shard.max_attempts):
+            seed = [shard.seed, task_id(shard.task), variation, episode, attempt]
+            rng = np.random.default_rng(np.random.SeedSequence(seed))
+            demonstration = demonstrate(simulation, variation, shard.noise, shard.steps_after_success, rng)
+            if demonstration is not None:
+                length = len(demonstration.actions)
+                moved = variation != order[0]
+                record.episodes.append(
+                    EpisodeRecord(shard.task, episode, variation, moved, attempt, seed, length)
+                )
+                return demonstration
+            record.failures[variation] = record.failures.get(variation, 0) + 1
+    raise RuntimeError(
+        f"{shard.task}, episode {episode}: the scripted expert failed {shard.max_attempts} attempts on each of "
+        f"the variations {order} at noise {shard.noise}. Lower --noise, raise --max_attempts or add variations."
+    )
+
+
+def merge_shards(shards: list[Shard], folder: Path, repo_id: str, root: Path) -> None:
+    """Merge finished shards, in their order, into one LeRobotDataset at `root`."""
+    aggregate_datasets(
+        repo_ids=[_shard_repo_id(shard) for shard in shards],
+        roots=[folder / shard.name for shard in shards],
+        aggr_repo_id=repo_id,
+        aggr_root=root,
+    )
+
+
+def _shard_repo_id(shard: Shard) -> str:
+    return f"shards/{shard.name}"
+
+
+def _create_dataset(root: Path, shard: Shard) -> LeRobotDataset:
+    return LeRobotDataset.create(
+        repo_id=_shard_repo_id(shard),
+        root=root,
+        fps=FPS,
+        robot_type=ROBOT_TYPE,
+        features=metaworld_features(shard.image_size),
+        # Full chroma resolution: with yuv420p the 3-pixel red dot that marks reach-v3's goal is lost.
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=10),
+        streaming_encoding=True,
+        encoder_queue_maxsize=MAX_EPISODE_STEPS,  # a full queue drops frames
+        encoder_threads=1,
+    )

@@ -1,0 +1,96 @@
+"""Writing shards, in this process or in several."""
+
+import logging
+import multiprocessing
+import os
+import threading
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from multiprocessing.queues import SimpleQueue
+from pathlib import Path
+
+import av.logging
+import datasets
+from tqdm import tqdm
+
+from lerobot_wm.pipeline.collect_shards import Shard, write_shard
+
+
+def write_missing_shards(shards: list[Shard], folder: Path, num_workers: int) -> None:
+    """Write the shards that `folder` does not hold yet, with a progress bar over all episodes."""
+    missing = [shard for shard in shards if not (folder / shard.name).exists()]
+    total = sum(shard.count for shard in shards)
+    done = total - sum(shard.count for shard in missing)
+    with tqdm(total=total, initial=done, unit="episode", desc="collecting") as bar:
+        if num_workers == 1 or len(missing) <= 1:
+            for shard in missing:
+                write_shard(shard, folder, on_episode=bar.update)
+        else:
+            _write_in_parallel(missing, folder, min(num_workers, len(missing)), bar)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what LeRobot, `datasets` and the codec print per episode off the screen, errors excepted."""
+    logger = logging.getLogger("lerobot")
+    level = logger.level
+    bars = datasets.utils.logging.is_progress_bar_enabled()
+    try:
+        with warnings.catch_warnings():
+            _silence()
+            yield
+    finally:
+        logger.setLevel(level)
+        av.logging.set_libav_level(av.logging.INFO)  # libav's default; it cannot be asked for
+        if bars:
+            datasets.enable_progress_bars()
+
+
+def _silence() -> None:
+    logging.getLogger("lerobot").setLevel(logging.ERROR)
+    av.logging.set_libav_level(av.logging.ERROR)
+    datasets.disable_progress_bars()
+    # Experts command more than +-1 by design; their actions are clipped before they are recorded.
+    warnings.filterwarnings("ignore", message="Constant.s. may be too high")
+
+
+def _write_in_parallel(shards: list[Shard], folder: Path, num_workers: int, bar: tqdm) -> None:
+    # Workers are forked from a server that has imported LeRobot once and holds no threads and no OpenGL.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["lerobot_wm.pipeline.collect_workers"])
+    finished = context.SimpleQueue()
+    with ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(finished,)) as pool:
+        pending = {pool.submit(_write_and_count, shard, folder) for shard in shards}
+        while pending:
+            done, pending = wait(pending, timeout=0.2, return_when=FIRST_EXCEPTION)
+            while not finished.empty():
+                finished.get()
+                bar.update()
+            if any(future.exception() is not None for future in done):
+                pool.shutdown(cancel_futures=True)
+            for future in done:
+                future.result()
+
+
+_finished: "SimpleQueue[None]"  # of a worker: one item per episode it has saved
+
+
+def _start_worker(finished: "SimpleQueue[None]") -> None:
+    global _finished
+    _finished = finished
+    # A worker must not outlive a killed parent: it would write into the next run's folder.
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    _silence()
+
+
+def _exit_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _write_and_count(shard: Shard, folder: Path) -> None:
+    write_shard(shard, folder, on_episode=lambda: _finished.put(None))

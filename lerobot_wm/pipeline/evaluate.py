@@ -1,0 +1,112 @@
+"""`lerobot-wm eval`: lerobot-eval with its flags, one record per rollout.
+
+What is added to LeRobot's own rollouts: each seed runs exactly once whatever the batch size, tasks can be
+spread over processes, and every rollout leaves a line in a records file.
+"""
+
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import torch
+from lerobot.configs import parser
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+from rich.console import Console
+from tqdm import tqdm
+
+from lerobot_wm.pipeline.eval_config import EvaluateConfig
+from lerobot_wm.pipeline.rollouts import TaskRunner, task_names
+from lerobot_wm.report.provenance import provenance
+from lerobot_wm.report.records import Record, record_line
+from lerobot_wm.report.statistics import ci95_summary, in_split
+from lerobot_wm.report.tables import table_by_split, terminal_tables
+
+# One policy per worker process, loaded once by `_start_worker`.
+_worker_run: Callable[[str], list[Record]]
+
+
+def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
+    global _worker_run
+    torch.set_num_threads(threads)
+    _worker_run = TaskRunner(cfg).run
+
+
+def _run_in_worker(task: str) -> list[Record]:
+    return _worker_run(task)
+
+
+def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
+    """Records task by task, in the order of `tasks`."""
+    if cfg.num_workers == 1:
+        yield from map(TaskRunner(cfg).run, tasks)
+        return
+    workers = min(cfg.num_workers, len(tasks))
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    with ProcessPoolExecutor(
+        workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=(cfg, threads)
+    ) as pool:
+        yield from pool.map(_run_in_worker, tasks)
+
+
+def evaluate(cfg: EvaluateConfig) -> list[Record]:
+    """Roll out every seed of every task; write records, videos and eval_info.json under `cfg.output_dir`.
+
+    The records file appears when the last rollout is done; until then its lines are in `<name>.part`.
+
+    Raises:
+        ValueError, FileExistsError: see `EvaluateConfig.validate`.
+    """
+    cfg.validate()
+    tasks = task_names(cfg)
+    started = time.perf_counter()
+    cfg.output_dir.mkdir(parents=True, exist_ok=True)
+    cfg.records_file.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = cfg.records_file.with_name(cfg.records_file.name + ".part")
+    records: list[Record] = []
+    with unfinished.open("w") as file, tqdm(total=len(tasks) * len(cfg.seeds), unit="rollout") as progress:
+        for of_task in _rollouts(cfg, tasks):
+            records += of_task
+            file.writelines(map(record_line, of_task))
+            file.flush()
+            progress.update(len(of_task))
+    unfinished.rename(cfg.records_file)
+    _write_info(cfg, records, seconds=time.perf_counter() - started)
+    return records
+
+
+def _write_info(cfg: EvaluateConfig, records: list[Record], seconds: float) -> None:
+    """eval_info.json: success rates with intervals per task, per split and overall, and what made them."""
+
+    def chosen(split: str) -> list[Record]:
+        return [record for record in records if in_split(record, split)]
+
+    tasks = dict.fromkeys(record["task"] for record in records)
+    info = {
+        "arm": cfg.arm_name,
+        "policy_path": str(cfg.policy.pretrained_path),
+        "per_task": {task: ci95_summary(r for r in records if r["task"] == task) for task in tasks},
+        **{split: ci95_summary(chosen(split)) for split in ("seen", "unseen") if chosen(split)},
+        "overall": ci95_summary(records),
+        "eval_s": seconds,
+        "provenance": provenance(),
+    }
+    (cfg.output_dir / "eval_info.json").write_text(json.dumps(info, indent=2) + "\n")
+
+
+@parser.wrap()
+def _evaluate_from_command_line(cfg: EvaluateConfig) -> None:
+    records = evaluate(cfg)
+    Console(width=100).print(*terminal_tables(table_by_split(f"Success of {cfg.arm_name}", records)))
+    logging.info("Records: %s", cfg.records_file)
+
+
+def main() -> None:
+    """Entry point of `lerobot-wm eval`."""
+    init_logging()
+    register_third_party_plugins()
+    _evaluate_from_command_line()  # type: ignore[call-arg]

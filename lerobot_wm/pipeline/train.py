@@ -1,0 +1,106 @@
+"""`lerobot-wm train`: LeRobot's own training loop, fed from RAM or GPU memory instead of its DataLoader."""
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+from accelerate import Accelerator, DistributedDataParallelKwargs
+from accelerate.data_loader import BatchSamplerShard
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.scripts.lerobot_train import train as lerobot_train
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.logging_utils import MetricsTracker
+
+from lerobot_wm.constants import OBS_LATENT
+from lerobot_wm.data.loader import RamLoader
+from lerobot_wm.pipeline.encode import encode_to_cache
+from lerobot_wm.policies.latent_config import LatentPolicyConfig
+
+TRAIN_LOG_NAME = "train_log.jsonl"
+
+
+class RamAccelerator(Accelerator):
+    """An Accelerator whose data loaders serve LeRobot's batches from memory; everything else is accelerate's."""
+
+    def prepare_data_loader(self, data_loader: Any, *args: Any, **kwargs: Any) -> RamLoader:
+        """Replace the loader by one that reads the same samples, this process's share of them, from memory."""
+        batch_sampler = data_loader.batch_sampler
+        if self.num_processes > 1:
+            batch_sampler = BatchSamplerShard(batch_sampler, self.num_processes, self.process_index)
+        with self.main_process_first():  # the first decodes the frames, the others map them
+            return RamLoader(data_loader, batch_sampler, self.device)
+
+
+class TrainLog(logging.Filter):
+    """Writes the metrics LeRobot logs to `<output_dir>/train_log.jsonl`, one line per log step.
+
+    It is a filter on the root logger, which LeRobot's `init_logging` leaves in place when it replaces handlers.
+    """
+
+    def __init__(self, output_dir: Path) -> None:
+        super().__init__()
+        self._path = output_dir / TRAIN_LOG_NAME
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Note metrics in passing; every record goes through."""
+        if isinstance(record.msg, MetricsTracker):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a") as file:
+                file.write(json.dumps({"step": record.msg.steps, **record.msg.to_dict()}) + "\n")
+        return True
+
+
+def make_accelerator(policy: PreTrainedConfig) -> RamAccelerator:
+    """The Accelerator LeRobot's train() would make for this policy, with our loaders."""
+    # As in LeRobot: a policy's own `dtype` decides the precision, `use_amp` where it has none.
+    dtype = getattr(policy, "dtype", "bfloat16" if policy.use_amp else "float32")
+    return RamAccelerator(
+        step_scheduler_with_optimizer=False,
+        mixed_precision={"bfloat16": "bf16", "float16": "fp16"}.get(dtype, "no"),
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
+        cpu=policy.device == "cpu",
+    )
+
+
+def encode_if_needed(cfg: TrainPipelineConfig) -> None:
+    """Point a latent policy's training at latents, encoding an image dataset first, once, into its cache.
+
+    Args:
+        cfg: Changed in place: its dataset becomes the encoded one.
+    """
+    policy = cfg.policy
+    if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent or policy.world_model_path is None:
+        return
+    meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
+    if OBS_LATENT not in meta.features:
+        encoded = encode_to_cache(policy.world_model_path, cfg.dataset.repo_id, meta, str(policy.device))
+        cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
+        cfg.dataset.revision = None
+
+
+@parser.wrap()
+def train(cfg: TrainPipelineConfig) -> None:
+    """Train any LeRobot policy as `lerobot-train` does, from the same flags, into the same checkpoints."""
+    cfg.validate()
+    if cfg.policy is None:
+        raise ValueError(
+            "lerobot-wm train trains policies (--policy.type=...); for reward models use lerobot-train."
+        )
+    if cfg.dataset.streaming:
+        raise ValueError("--dataset.streaming=true reads no dataset into memory: use lerobot-train for it.")
+    encode_if_needed(cfg)
+    log = TrainLog(cfg.output_dir)
+    logging.getLogger().addFilter(log)
+    try:
+        lerobot_train(cfg, accelerator=make_accelerator(cfg.policy))
+    finally:
+        logging.getLogger().removeFilter(log)
+
+
+def main() -> None:
+    """Entry point of `lerobot-wm train`."""
+    register_third_party_plugins()
+    train()

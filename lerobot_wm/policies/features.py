@@ -1,0 +1,50 @@
+"""What the policy configurations share: precision, and reading sizes from LeRobot's features."""
+
+from typing import Any
+
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+from torch import Tensor
+
+# Scaling is part of our models (lerobot_wm.nn.normalize): a policy and the frozen world model inside it were
+# fitted on different statistics, which one processor pipeline cannot hold. LeRobot's normalisers do nothing.
+IDENTITY_NORMALIZATION: dict[str, NormalizationMode] = dict.fromkeys(
+    ("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
+)
+
+
+def default_dtype(device: str) -> str:
+    """The autocast type training runs fastest in: bfloat16 where the hardware multiplies it, else float32."""
+    if device.startswith("cuda"):
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    return "bfloat16" if device == "cpu" and torch.cpu._is_avx512_bf16_supported() else "float32"
+
+
+def feature_dim(features: dict[str, PolicyFeature], key: str, where: str) -> int:
+    """Size of the vector feature `key`.
+
+    Raises:
+        ValueError: The feature is missing; names what is there.
+    """
+    if key not in features:
+        raise ValueError(f"{where} has no '{key}'; it has {sorted(features)}.")
+    return features[key].shape[0]
+
+
+def image_keys(features: dict[str, PolicyFeature]) -> list[str]:
+    """The camera keys among the features, in order."""
+    return [key for key, feature in features.items() if feature.type is FeatureType.VISUAL]
+
+
+def stat(dataset_stats: dict[str, dict[str, Any]] | None, key: str, name: str) -> Tensor:
+    """One statistic of a dataset feature as a float32 vector.
+
+    Raises:
+        ValueError: The dataset carries no such statistic.
+    """
+    if not dataset_stats or key not in dataset_stats or name not in dataset_stats[key]:
+        raise ValueError(
+            f"The dataset's meta/stats.json has no '{name}' of '{key}', which scales the model's inputs; "
+            "recompute the statistics with `lerobot-edit-dataset --operation.type recompute_stats`."
+        )
+    return torch.as_tensor(dataset_stats[key][name], dtype=torch.float32).flatten()

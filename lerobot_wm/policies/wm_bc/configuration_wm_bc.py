@@ -1,0 +1,13 @@
+"""Configuration of multi-task behaviour cloning on world-model latents."""
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_wm.policies.latent_config import LatentPolicyConfig
+
+
+@PreTrainedConfig.register_subclass("wm_bc")
+@dataclass
+class WMBCConfig(LatentPolicyConfig):
+    """Two-layer MLP regressed on the demonstrated actions (paper section 3.1.2)."""

@@ -1,0 +1,46 @@
+"""Multi-task behaviour cloning on world-model latents."""
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from lerobot_wm.constants import ACTION, OBS_LATENT, OBS_STATE
+from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
+from lerobot_wm.rl.bc import bc_loss
+
+
+class WMBCPolicy(LatentPolicy):
+    """An MLP from [latent, one-hot task, proprioception] to the action, trained with mean squared error."""
+
+    config_class = WMBCConfig
+    name = "wm_bc"
+
+    def __init__(self, config: WMBCConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        self.actor = MLP(
+            config.observation_dim, config.hidden_dims, config.action_dim, nn.ReLU, config.dropout
+        )
+
+    def get_optim_params(self) -> dict:
+        """The actor's parameters: the world model is frozen."""
+        return list(self.actor.parameters())  # type: ignore[return-value]
+
+    def actor_mean(self, observation: Tensor) -> Tensor:
+        """The regressed action (B, A) for observations (B, O)."""
+        return self.actor(observation)
+
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
+        """Mean squared error on a batch of frames.
+
+        Args:
+            batch: `observation.latent` (B, D+S), `observation.state` (B, P), `action` (B, A), `task` (B strings).
+
+        Returns:
+            The scalar loss, and no parts: the loss is all there is.
+        """
+        state = batch[OBS_STATE]
+        latent = batch[OBS_LATENT] if self.config.use_latent else None
+        observation = self.observation(state, self.one_hot_tasks(batch, state.shape[0]), latent)
+        return bc_loss(self.actor(observation), self.action_scaling(batch[ACTION])), {}

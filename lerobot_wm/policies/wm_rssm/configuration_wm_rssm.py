@@ -1,0 +1,99 @@
+"""Configuration of the world model as a LeRobot policy type."""
+
+from dataclasses import dataclass, field
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+
+from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, default_dtype, feature_dim, image_keys
+from lerobot_wm.policies.optim import FusedAdamConfig
+from lerobot_wm.world_model.config import RSSMConfig
+
+
+@PreTrainedConfig.register_subclass("wm_rssm")
+@dataclass
+class WMRSSMConfig(PreTrainedConfig):
+    """The paper's RSSM, trained on windows of images and actions (section 3.1.1).
+
+    Args:
+        rssm: Sizes and loss weights; its input sizes are filled from the dataset.
+        window_length: Steps per training window T. A window starts at any frame from a zero state.
+        image_key: The camera to model; None takes the dataset's only camera.
+        lr: Learning rate of Adam.
+        grad_clip_norm: Joint gradient norm above which gradients are scaled down.
+        dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in.
+    """
+
+    rssm: RSSMConfig = field(default_factory=RSSMConfig)
+    window_length: int = 25
+    image_key: str | None = None
+    lr: float = 6e-4
+    grad_clip_norm: float = 100.0
+    dtype: str | None = None
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict(IDENTITY_NORMALIZATION)
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.window_length < 2:
+            raise ValueError(f"window_length is {self.window_length}; a window needs at least 2 steps.")
+        if self.dtype is None:
+            self.dtype = default_dtype(str(self.device))
+
+    @property
+    def drop_n_last_frames(self) -> int:
+        """LeRobot's sampler leaves these out, so that every training window lies within its episode."""
+        return self.window_length - 1
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """Frames of a window, relative to its first."""
+        return list(range(self.window_length))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """Frames of a window, relative to its first."""
+        return list(range(self.window_length))
+
+    @property
+    def reward_delta_indices(self) -> list[int]:
+        """Frames of a window, relative to its first."""
+        return list(range(self.window_length))
+
+    def validate_features(self) -> None:
+        """Choose the camera and fill the model's input sizes from the dataset's features.
+
+        Raises:
+            ValueError: No camera or several, no action, or sizes unlike the checkpoint's.
+        """
+        cameras = image_keys(self.input_features)
+        if self.image_key is None and len(cameras) == 1:
+            self.image_key = cameras[0]
+        if self.image_key not in cameras:
+            raise ValueError(
+                f"wm_rssm models one camera; the dataset has {cameras or 'none'} and --policy.image_key is "
+                f"{self.image_key!r}. Set --policy.image_key to one of the dataset's cameras."
+            )
+        sizes = {
+            "action_dim": feature_dim(self.output_features, ACTION, "The dataset"),
+            "image_channels": self.input_features[self.image_key].shape[0],
+        }
+        if self.rssm.use_proprio:
+            sizes["proprio_dim"] = feature_dim(self.input_features, OBS_STATE, "The dataset")
+        for name, size in sizes.items():
+            known = getattr(self.rssm, name)
+            if known not in (0, size):
+                raise ValueError(
+                    f"This world model was made for {name} {known}, here it is {size}: use the kind of dataset or "
+                    "environment it was trained on, or train another world model."
+                )
+            setattr(self.rssm, name, size)
+
+    def get_optimizer_preset(self) -> FusedAdamConfig:
+        """Adam 6e-4 with gradients clipped at 100, as in Dreamer V1 and TorchRL."""
+        return FusedAdamConfig(lr=self.lr, grad_clip_norm=self.grad_clip_norm)
+
+    def get_scheduler_preset(self) -> None:
+        """A constant learning rate."""
+        return None

@@ -1,0 +1,96 @@
+"""The world model as a LeRobot policy: `forward` is its training loss on windows."""
+
+from typing import Any, NoReturn
+
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from torch import Tensor, nn
+
+from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
+from lerobot_wm.nn.conv import IMAGE_SIZE
+from lerobot_wm.policies.features import stat
+from lerobot_wm.policies.pretrained import StrictPolicy
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+from lerobot_wm.world_model.model import WorldModel
+
+
+def resize_images(images: Tensor) -> Tensor:
+    """Bring images (..., C, H, W) in [0, 1] to the model's 64x64 by area averaging; 64x64 passes untouched."""
+    if images.shape[-2:] == (IMAGE_SIZE, IMAGE_SIZE):
+        return images
+    lead = images.shape[:-3]
+    flat = nn.functional.interpolate(images.flatten(0, -4), size=(IMAGE_SIZE, IMAGE_SIZE), mode="area")
+    return flat.unflatten(0, lead)
+
+
+class WMRSSMPolicy(StrictPolicy):
+    """An RSSM pretrained on the images and actions of all tasks.
+
+    It has no action head: `wm_bc` and `wm_iql` act on its latents.
+    """
+
+    config_class = WMRSSMConfig
+    name = "wm_rssm"
+
+    def __init__(
+        self,
+        config: WMRSSMConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        super().__init__(config)
+        config.validate_features()
+        if dataset_meta is not None and REWARD not in dataset_meta.features:
+            config.rssm.predict_reward = False  # nothing to predict; the model is trained without the head
+        self.world_model = WorldModel(config.rssm)
+        if dataset_stats is not None:  # a checkpoint's own values replace these when it is loaded
+            self.world_model.action_scaling.set_range(
+                stat(dataset_stats, ACTION, "min"), stat(dataset_stats, ACTION, "max")
+            )
+            if config.rssm.use_proprio:
+                self.world_model.proprio_scaling.set_standard(
+                    stat(dataset_stats, OBS_STATE, "mean"), stat(dataset_stats, OBS_STATE, "std")
+                )
+
+    def get_optim_params(self) -> dict:
+        """Every parameter: the whole world model is trained."""
+        return list(self.parameters())  # type: ignore[return-value]  # LeRobot's annotation is narrower than its use
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """The world-model loss on a batch of windows.
+
+        Args:
+            batch: The camera (B, T, C, H, W) in [0, 1], `action` (B, T, A), `action_is_pad` (B, T), and
+                `next.reward` (B, T), `observation.state` (B, T, P) where the configuration uses them.
+
+        Returns:
+            The scalar loss and its parts by name.
+        """
+        rssm = self.config.rssm
+        loss, parts = self.world_model.loss(
+            images=resize_images(batch[self.config.image_key]),
+            actions=batch[ACTION],
+            valid=~batch[f"{ACTION}_is_pad"],
+            rewards=batch[REWARD] if rssm.predict_reward else None,
+            proprio=batch[OBS_STATE] if rssm.use_proprio else None,
+        )
+        values = torch.stack(list(parts.values())).tolist()  # one transfer from the device for all of them
+        return loss, dict(zip(parts, values, strict=True))
+
+    def reset(self) -> None:
+        """Nothing to reset: no recurrent state is kept between calls."""
+
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> NoReturn:
+        """Refuse: a world model has no policy.
+
+        Raises:
+            NotImplementedError: Always; says which policy types act.
+        """
+        raise NotImplementedError(
+            "wm_rssm is a world model and chooses no actions. Train a policy on its latents: "
+            "lerobot-wm train --policy.type=wm_bc (or wm_iql) --policy.world_model_path=<this checkpoint>."
+        )
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> NoReturn:
+        """Refuse, as `select_action` does."""
+        self.select_action(batch)

@@ -1,0 +1,109 @@
+"""`lerobot-wm report`: records -> success tables in the terminal and one self-contained HTML page."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import draccus
+from lerobot.utils.import_utils import register_third_party_plugins
+from rich.console import Console
+
+from lerobot_wm.report.curves import curve_figures, read_curves
+from lerobot_wm.report.inline import PNG, SVG, data_uri, figure_bytes
+from lerobot_wm.report.open_loop import load_world_model, open_loop, strips_figure
+from lerobot_wm.report.page import Page
+from lerobot_wm.report.provenance import provenance
+from lerobot_wm.report.records import find_records, read_records
+from lerobot_wm.report.tables import markdown_table, runs, table_by_run, table_by_split, terminal_tables
+from lerobot_wm.report.videos import read_evaluation
+
+TERMINAL_WIDTH = 100
+
+
+@dataclass
+class ReportDatasetConfig:
+    """The dataset whose episodes the world model predicts."""
+
+    repo_id: str | None = None
+    root: str | None = None
+
+
+@dataclass
+class ReportConfig:
+    """Flags of `lerobot-wm report`; lists are separated by commas."""
+
+    # Records files or globs, as written by `lerobot-wm eval`.
+    records: str
+    output_dir: Path = Path("outputs/report")
+    title: str = "World-model policies"
+    # Output folders of `lerobot-wm eval` whose videos are shown.
+    videos: str | None = None
+    # Output folders of `lerobot-wm train` whose curves are shown.
+    train_logs: str | None = None
+    # Checkpoint of wm_rssm, wm_bc or wm_iql whose predictions on `--dataset.*` are shown.
+    world_model_path: str | None = None
+    dataset: ReportDatasetConfig = field(default_factory=ReportDatasetConfig)
+
+    def validate(self) -> None:
+        """Refuse half of a pair of flags.
+
+        Raises:
+            ValueError: a world model without a dataset, or a dataset without a world model.
+        """
+        if (self.world_model_path is None) != (self.dataset.repo_id is None):
+            raise ValueError(
+                "Open-loop prediction needs both --world_model_path and --dataset.repo_id (and --dataset.root "
+                f"for a local one); found {self.world_model_path} and {self.dataset.repo_id}."
+            )
+
+
+def report(cfg: ReportConfig) -> Path:
+    """Print the success tables; write `index.html`, `success.md` and, with a world model, `open_loop.png`.
+
+    Returns:
+        The page.
+
+    Raises:
+        ValueError, FileNotFoundError: an input is missing or is not what its flag takes.
+    """
+    cfg.validate()
+    records = read_records(find_records(cfg.records))
+    facts = provenance()
+    page = Page(
+        title=cfg.title,
+        table=table_by_run(records),
+        run_tables=[table_by_split(name, of_run) for name, of_run in runs(records).items()],
+        n_rollouts=len(records),
+        has_splits=any(record["seen"] is not None for record in records),
+        provenance={name: fact for name, fact in facts.items() if name != "command"},
+    )
+    for folder in _paths(cfg.videos):
+        evaluation = read_evaluation(folder)
+        page.clips += evaluation.clips
+        page.commands.append(evaluation.command)
+    page.commands.append(facts["command"])
+    logs = {run.name: read_curves(run) for run in _paths(cfg.train_logs)}
+    page.curves = [data_uri(figure_bytes(figure, SVG), SVG) for figure in curve_figures(logs)]
+    cfg.output_dir.mkdir(parents=True, exist_ok=True)
+    if cfg.world_model_path is not None and cfg.dataset.repo_id is not None:
+        page.dataset = cfg.dataset.repo_id
+        page.open_loop = open_loop(load_world_model(cfg.world_model_path), page.dataset, cfg.dataset.root)
+        picture = figure_bytes(strips_figure(page.open_loop), PNG)
+        (cfg.output_dir / "open_loop.png").write_bytes(picture)
+        page.strips = data_uri(picture, PNG)
+
+    Console(width=TERMINAL_WIDTH).print(*terminal_tables(page.table))
+    (cfg.output_dir / "success.md").write_text(markdown_table(page.table))
+    index = cfg.output_dir / "index.html"
+    index.write_text(page.html())
+    return index
+
+
+def _paths(comma_separated: str | None) -> list[Path]:
+    return [Path(path.strip()) for path in comma_separated.split(",")] if comma_separated else []
+
+
+def main() -> None:
+    """Entry point of `lerobot-wm report`."""
+    register_third_party_plugins()
+    index = report(draccus.parse(ReportConfig))
+    print(f"Report: {index}")

@@ -1,0 +1,22 @@
+"""Pictures and videos as data URIs, so that one HTML file holds everything."""
+
+import io
+from base64 import b64encode
+
+from matplotlib.figure import Figure
+
+SVG, PNG, MP4 = "image/svg+xml", "image/png", "video/mp4"
+
+
+def data_uri(content: bytes, mime_type: str) -> str:
+    """A `src` attribute that carries the content itself."""
+    return f"data:{mime_type};base64,{b64encode(content).decode()}"
+
+
+def figure_bytes(figure: Figure, mime_type: str) -> bytes:
+    """A matplotlib figure as a PNG or SVG file."""
+    buffer = io.BytesIO()
+    # Date=None: the same figure gives the same bytes.
+    metadata = {"Date": None} if mime_type == SVG else {}
+    figure.savefig(buffer, format="svg" if mime_type == SVG else "png", dpi=100, metadata=metadata)
+    return buffer.getvalue()

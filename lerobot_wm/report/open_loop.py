@@ -1,0 +1,142 @@
+"""Open-loop prediction: the world model sees five frames, then imagines from actions alone."""
+
+from dataclasses import dataclass
+from textwrap import fill
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import get_policy_class
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy, resize_images
+
+CONTEXT = 5  # frames the model sees
+HORIZONS = (1, 5, 10, 20, 45)  # frames ahead of the last one it saw
+WINDOW = CONTEXT + HORIZONS[-1]
+EPISODES_PER_TASK = 4
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Predictions on one task's episodes, from their first frames on.
+
+    `truth` (CONTEXT + H, C, H, W) and `imagined` (H, C, H, W) are the first episode's images in [0, 1].
+    PSNR is in dB by horizon, from the squared error averaged over pixels and episodes; `copy_psnr` is that of
+    repeating the last frame seen.
+    """
+
+    task: str
+    n_episodes: int
+    truth: np.ndarray
+    imagined: np.ndarray
+    psnr: list[float]
+    copy_psnr: list[float]
+
+
+def load_world_model(path: str) -> WMRSSMPolicy | LatentPolicy:
+    """A checkpoint (folder or Hub id) that holds a world model: wm_rssm, or a policy on its latents.
+
+    Raises:
+        ValueError: the checkpoint holds none.
+    """
+    config = PreTrainedConfig.from_pretrained(path)
+    policy = get_policy_class(config.type).from_pretrained(path, config=config)
+    blind = isinstance(policy, LatentPolicy) and not policy.config.use_latent
+    if blind or not isinstance(policy, WMRSSMPolicy | LatentPolicy):
+        raise ValueError(
+            f"{path} ({config.type}) holds no world model: give a wm_rssm, wm_bc or wm_iql checkpoint."
+        )
+    return policy.eval()
+
+
+def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | None) -> list[OpenLoop]:
+    """Predict the last episodes of each task (those LeRobot's `eval_split` holds out).
+
+    Raises:
+        ValueError: no episode is long enough.
+    """
+    fps = LeRobotDatasetMetadata(repo_id, root=root).fps
+    times = [step / fps for step in range(WINDOW)]
+    keys = (policy.config.image_key, ACTION, OBS_STATE)
+    dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(keys, times))
+    starts: dict[str, list[int]] = {}
+    for episode in dataset.meta.episodes:
+        if episode["length"] >= WINDOW:
+            starts.setdefault(episode["tasks"][0], []).append(episode["dataset_from_index"])
+    if not starts:
+        raise ValueError(f"{repo_id} has no episode of {WINDOW} frames, which open-loop prediction needs.")
+    return [
+        predict(policy, task, [dataset[i] for i in indices[-EPISODES_PER_TASK:]])
+        for task, indices in starts.items()
+    ]
+
+
+@torch.no_grad()
+def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[str, Tensor]]) -> OpenLoop:
+    """Filter the first CONTEXT frames of each window, imagine the rest under its actions.
+
+    Args:
+        policy: holds the world model.
+        task: what the windows show.
+        windows: each the first WINDOW frames of an episode: camera (T, C, H, W) in [0, 1], `action` (T, A),
+            `observation.state` (T, P).
+    """
+
+    def batch(key: str) -> Tensor:
+        return torch.stack([window[key] for window in windows]).to(policy.config.device)
+
+    world_model, image_key = policy.world_model, policy.config.image_key
+    assert image_key is not None  # whoever holds a world model has a camera
+    images = resize_images(batch(image_key))  # (B, T, C, 64, 64)
+    actions = batch(ACTION)  # (B, T, A)
+    proprio = batch(OBS_STATE)[:, :CONTEXT] if world_model.config.use_proprio else None
+    context = world_model.filter(images[:, :CONTEXT], actions[:, :CONTEXT], proprio)
+    # The first imagined step is reached by the action executed at the last frame seen.
+    states = world_model.imagine(context.last(), actions[:, CONTEXT - 1 : -1])
+    imagined = world_model.decode(states.latent)  # (B, T - CONTEXT, C, 64, 64)
+    future, last_seen = images[:, CONTEXT:], images[:, CONTEXT - 1 : CONTEXT]
+    return OpenLoop(
+        task=task,
+        n_episodes=len(windows),
+        truth=images[0].cpu().numpy(),
+        imagined=imagined[0].cpu().numpy(),
+        psnr=_psnr(imagined, future),
+        copy_psnr=_psnr(last_seen, future),
+    )
+
+
+def strips_figure(results: list[OpenLoop]) -> Figure:
+    """Two rows per task, truth above imagination: the last context frame, then the horizons."""
+    figure = Figure(figsize=(1.3 * (len(HORIZONS) + 1), 2.75 * len(results)), layout="constrained")
+    axes = figure.subplots(2 * len(results), len(HORIZONS) + 1, squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for result, (above, below) in zip(results, axes.reshape(len(results), 2, -1), strict=True):
+        above[0].imshow(_pixels(result.truth[CONTEXT - 1]))
+        above[0].set_title("last seen", fontsize=8)
+        name = below[0].text(
+            0, 0.5, fill(result.task, 14), fontsize=8, transform=below[0].transAxes, va="center"
+        )
+        name.set_in_layout(False)  # or it would widen its column
+        for column, horizon in enumerate(HORIZONS, start=1):
+            above[column].imshow(_pixels(result.truth[CONTEXT - 1 + horizon]))
+            above[column].set_title(f"+{horizon}", fontsize=8)
+            below[column].imshow(_pixels(result.imagined[horizon - 1]))
+    return figure
+
+
+def _psnr(predicted: Tensor, truth: Tensor) -> list[float]:
+    """PSNR in dB at each horizon, images (B, T, C, H, W) in [0, 1]."""
+    error = (predicted - truth).square().mean(dim=(0, 2, 3, 4))[[horizon - 1 for horizon in HORIZONS]]
+    return (-10 * error.log10()).tolist()
+
+
+def _pixels(image: np.ndarray) -> np.ndarray:
+    """(C, H, W) -> (H, W, C)."""
+    return image.transpose(1, 2, 0)

@@ -1,0 +1,23 @@
+"""Where numbers come from: the command, the versions and the kind of machine."""
+
+import os
+import platform
+import shlex
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+PACKAGES = ("lerobot_policy_wm", "lerobot", "torch", "mujoco", "metaworld", "gymnasium", "numpy")
+
+
+def provenance() -> dict[str, str]:
+    """What produced a result in this process: name -> value."""
+    command = f"{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}"
+    facts = {"command": command, "python": platform.python_version()}
+    facts |= {package: version(package) for package in PACKAGES}
+    facts["system"] = f"{platform.system()} {platform.machine()}"
+    facts["CPU cores"] = str(os.cpu_count())
+    facts["GPU"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    return facts

@@ -1,0 +1,80 @@
+"""Records: one JSON line per rollout, written by `lerobot-wm eval` and read by `lerobot-wm report`."""
+
+import json
+from collections.abc import Iterable
+from glob import glob
+from pathlib import Path
+from typing import TypedDict
+
+# "return" is a Python keyword, hence the functional form.
+Record = TypedDict(
+    "Record",
+    {
+        "arm": str,
+        "policy_type": str,
+        "preset": str,
+        "seed": int | None,  # training seed of the policy; None when the checkpoint does not tell
+        "task": str,
+        "variation": int,  # Meta-World: one of the 50 fixed variations; elsewhere: the environment's seed
+        "seen": bool | None,  # was the variation collected on? None where the notion does not exist
+        "success": bool,
+        "steps": int,  # environment steps until the episode ended
+        "return": float,  # sum of rewards over those steps
+    },
+)
+RECORD_KEYS = frozenset(Record.__annotations__)
+
+
+def record_line(record: Record) -> str:
+    """One record as its line of a records file, newline included."""
+    return json.dumps(record) + "\n"
+
+
+def find_records(patterns: str) -> list[Path]:
+    """Files named by a comma-separated list of paths and globs, sorted within each glob.
+
+    Raises:
+        FileNotFoundError: when an entry of the list matches no file.
+    """
+    paths: list[Path] = []
+    for pattern in patterns.split(","):
+        found = sorted(glob(pattern.strip(), recursive=True))
+        if not found:
+            raise FileNotFoundError(f"No records at '{pattern}': expected files of `lerobot-wm eval`.")
+        paths += [Path(path) for path in found if Path(path) not in paths]
+    return paths
+
+
+def read_records(paths: Iterable[Path]) -> list[Record]:
+    """All records of the files, in order.
+
+    Raises:
+        ValueError: when a line is not a record, when a rollout occurs twice, or when there is none at all.
+    """
+    records: list[Record] = []
+    origins: dict[tuple, str] = {}
+    for path in paths:
+        for number, line in enumerate(path.read_text().splitlines(), start=1):
+            record = _parse(line, where=f"{path}:{number}")
+            rollout = (record["arm"], record["seed"], record["task"], record["variation"])
+            if rollout in origins:
+                raise ValueError(
+                    f"{path}:{number} repeats the rollout (arm, seed, task, variation) = {rollout} of "
+                    f"{origins[rollout]}. Give each run once, and different runs different --arm names."
+                )
+            origins[rollout] = f"{path}:{number}"
+            records.append(record)
+    if not records:
+        raise ValueError("The records files are empty: run `lerobot-wm eval` first.")
+    return records
+
+
+def _parse(line: str, where: str) -> Record:
+    try:
+        record: Record = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{where} is not JSON ({error}): expected one record per line.") from error
+    if not isinstance(record, dict) or set(record) != RECORD_KEYS:
+        found = sorted(record) if isinstance(record, dict) else type(record).__name__
+        raise ValueError(f"{where} is not a record: found {found}, expected the keys {sorted(RECORD_KEYS)}.")
+    return record

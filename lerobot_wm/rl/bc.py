@@ -1,0 +1,8 @@
+"""Behaviour cloning."""
+
+from torch import Tensor
+
+
+def bc_loss(prediction: Tensor, action: Tensor) -> Tensor:
+    """Mean squared error between predicted and demonstrated actions, both (B, A) (paper section 3.1.2)."""
+    return (prediction.float() - action.float()).square().mean()

@@ -1,0 +1,43 @@
+"""Sizes and loss weights of the world model."""
+
+from dataclasses import dataclass
+
+
+@dataclass
+class RSSMConfig:
+    """Sizes and loss weights of the paper's RSSM (section 3.1.1, on TorchRL's Dreamer layout).
+
+    Args:
+        deter_dim: Size of the deterministic state d_t.
+        stoch_dim: Size of the stochastic state z_t.
+        hidden_dim: Width of the layers around the GRU.
+        reward_hidden_dim: Width of the reward head's two hidden layers.
+        min_std: Lower bound of the standard deviations of prior and posterior.
+        kl_scale: Weight β of the KL term.
+        free_nats: KL per step (nats) below which the KL is not penalised.
+        reward_scale: Weight of the reward loss.
+        predict_reward: Whether there is a reward head (turned off for datasets without `next.reward`).
+        use_proprio: Encode and reconstruct proprioception beside the image (the paper's discarded variant).
+        image_channels: Channels of the image; filled from the dataset.
+        action_dim: Size of the action; filled from the dataset.
+        proprio_dim: Size of the proprioceptive state; filled from the dataset when `use_proprio`.
+    """
+
+    deter_dim: int = 256
+    stoch_dim: int = 256
+    hidden_dim: int = 256
+    reward_hidden_dim: int = 400
+    min_std: float = 0.1
+    kl_scale: float = 1.0
+    free_nats: float = 3.0
+    reward_scale: float = 1.0
+    predict_reward: bool = True
+    use_proprio: bool = False
+    image_channels: int = 0
+    action_dim: int = 0
+    proprio_dim: int = 0
+
+    @property
+    def latent_dim(self) -> int:
+        """Size of s_t = [d_t, z_t]."""
+        return self.deter_dim + self.stoch_dim

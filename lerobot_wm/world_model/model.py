@@ -1,0 +1,156 @@
+"""The world model: image encoder, RSSM, image decoder and reward head (paper section 3.1.1)."""
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_wm.nn.conv import EMBED_DIM, ConvDecoder, ConvEncoder
+from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.nn.normalize import Affine
+from lerobot_wm.world_model.config import RSSMConfig
+from lerobot_wm.world_model.losses import reconstruction_loss, world_model_loss
+from lerobot_wm.world_model.rssm import RSSM, RSSMState
+
+
+class WorldModel(nn.Module):
+    """An RSSM on images and actions only: no task id, and no proprioception unless `config.use_proprio`.
+
+    Time: frame t holds the image o_t, the action a_t executed there and the reward r_t that arrives with
+    o_{t+1}. The filter reads (s_{t-1}, a_{t-1}, o_t), with a_{-1} = 0; the reward head predicts r_{t-1} from s_t.
+
+    Actions and proprioception enter in the dataset's own units; `action_scaling` and `proprio_scaling` hold the
+    statistics that normalise them, so that a checkpoint needs nothing beside itself.
+    """
+
+    def __init__(self, config: RSSMConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = ConvEncoder(config.image_channels)
+        self.rssm = RSSM(config, EMBED_DIM)
+        self.decoder = ConvDecoder(config.latent_dim, config.image_channels)
+        self.action_scaling = Affine(config.action_dim)
+        if config.predict_reward:
+            self.reward_head = MLP(config.latent_dim, [config.reward_hidden_dim] * 2, 1)
+        if config.use_proprio:
+            self.proprio_scaling = Affine(config.proprio_dim)
+            self.proprio_fusion = MLP(EMBED_DIM + config.proprio_dim, [EMBED_DIM], EMBED_DIM)
+            self.proprio_decoder = MLP(config.latent_dim, [config.hidden_dim] * 2, config.proprio_dim)
+
+    def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
+        """Image embeddings e_t.
+
+        Args:
+            images: (B, T, C, 64, 64) in [0, 1].
+            proprio: (B, T, P), read only with `config.use_proprio`.
+
+        Returns:
+            (B, T, 1024).
+        """
+        batch_time = images.shape[:2]
+        embeds = self.encoder(images.flatten(0, 1)).unflatten(0, batch_time)
+        if self.config.use_proprio:
+            embeds = self.proprio_fusion(torch.cat([embeds, self.proprio_scaling(proprio)], dim=-1))
+        return embeds
+
+    def observe(
+        self,
+        images: Tensor,
+        prev_actions: Tensor,
+        state: RSSMState | None = None,
+        proprio: Tensor | None = None,
+        *,
+        sample: bool = False,
+    ) -> RSSMState:
+        """Filter (B, T) frames given the action before each: the streaming form, resumed from `state`.
+
+        Args:
+            images: o_t, (B, T, C, 64, 64) in [0, 1].
+            prev_actions: a_{t-1}, (B, T, A) in the dataset's units; zero where an episode starts.
+            state: s before the first frame, (B, ·); None starts an episode.
+            proprio: (B, T, P), with `config.use_proprio`.
+            sample: Draw z_t instead of taking the posterior mean.
+
+        Returns:
+            s_t for every frame, (B, T, ·).
+        """
+        if state is None:
+            state = self.rssm.initial_state(images.shape[0])
+        embeds = self.embed(images, proprio)
+        return self.rssm.observe(embeds, self.action_scaling(prev_actions), state, sample=sample)[0]
+
+    def filter(
+        self, images: Tensor, actions: Tensor, proprio: Tensor | None = None, *, sample: bool = False
+    ) -> RSSMState:
+        """Filter whole episodes: as `observe`, given the action executed *at* each frame.
+
+        Args:
+            images: o_t, (B, T, C, 64, 64) in [0, 1], from an episode's first frame on.
+            actions: a_t, (B, T, A); the last is not used.
+            proprio: (B, T, P), with `config.use_proprio`.
+            sample: Draw z_t instead of taking the posterior mean.
+
+        Returns:
+            s_t for every frame, (B, T, ·).
+        """
+        return self.filter_embeds(self.embed(images, proprio), actions, sample=sample)
+
+    def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> RSSMState:
+        """`filter` for images that are embedded already: embeds (B, T, 1024), actions a_t (B, T, A)."""
+        state = self.rssm.initial_state(embeds.shape[0])
+        return self.rssm.observe(embeds, self._shift(actions), state, sample=sample)[0]
+
+    def imagine(self, state: RSSMState, actions: Tensor, *, sample: bool = False) -> RSSMState:
+        """Predict s_{t+1} ... s_{t+H} from s_t (B, ·) under actions a_t ... a_{t+H-1}, (B, H, A)."""
+        return self.rssm.imagine(state, self.action_scaling(actions), sample=sample)
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Images (..., C, 64, 64), clipped to [0, 1], from latents (..., D+S)."""
+        lead = latents.shape[:-1]
+        return self.decoder(latents.flatten(0, -2)).float().clamp(0, 1).unflatten(0, lead)
+
+    def predict_reward(self, latents: Tensor) -> Tensor:
+        """The reward r_{t-1} that arrived with frame t, (...), from latents s_t (..., D+S)."""
+        return self.reward_head(latents).squeeze(-1)
+
+    def loss(
+        self,
+        images: Tensor,
+        actions: Tensor,
+        valid: Tensor,
+        rewards: Tensor | None = None,
+        proprio: Tensor | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The training loss on windows: reconstruction, reward and KL with free nats.
+
+        A window starts from the zero state and a zero previous action, wherever in its episode it lies.
+
+        Args:
+            images: (B, T, C, 64, 64) in [0, 1].
+            actions: a_t, (B, T, A).
+            valid: (B, T) bool, False where a window runs past the end of its episode.
+            rewards: r_t, (B, T); needed with `config.predict_reward`.
+            proprio: (B, T, P); needed with `config.use_proprio`.
+
+        Returns:
+            The scalar loss and its parts by name, each a detached scalar.
+        """
+        embeds = self.embed(images, proprio)
+        initial = self.rssm.initial_state(images.shape[0])
+        states, posterior = self.rssm.observe(embeds, self._shift(actions), initial, sample=True)
+        prior = self.rssm.prior(states.deter)
+        latents = states.latent  # (B, T, D+S)
+
+        decoded = self.decoder(latents.flatten(0, 1)).unflatten(0, latents.shape[:2])
+        errors = {"image_loss": reconstruction_loss(decoded, images)}  # (B, T)
+        if self.config.use_proprio:
+            errors["proprio_loss"] = reconstruction_loss(
+                self.proprio_decoder(latents), self.proprio_scaling(proprio)
+            )
+        if rewards is not None and self.config.predict_reward:
+            # s_t predicts r_{t-1}: the first frame of a window has no reward to predict.
+            reward_error = (self.predict_reward(latents[:, 1:]) - rewards[:, :-1].float()).square()
+            errors["reward_loss"] = nn.functional.pad(reward_error, (1, 0))
+        return world_model_loss(errors, posterior.kl(prior), valid, self.config)
+
+    def _shift(self, actions: Tensor) -> Tensor:
+        """a_t (B, T, A) -> scaled a_{t-1}, with a zero action (in the dataset's units) before the first frame."""
+        return self.action_scaling(nn.functional.pad(actions[:, :-1], (0, 0, 1, 0)))

@@ -1,0 +1,145 @@
+"""The recurrent state-space model: d_t = GRU(d_{t-1}, z_{t-1}, a_{t-1}), z_t ~ prior(d_t) or posterior(d_t, e_t).
+
+Layers follow TorchRL's Dreamer (the paper's base), itself Dreamer V1 (Hafner et al. 2019):
+prior Linear(z+a → H) ELU → GRU → Linear ELU → Linear(2S); posterior Linear(d+e → H) ELU → Linear(2S);
+std = max(softplus(·), min_std).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lerobot_wm.world_model.config import RSSMConfig
+
+
+@dataclass
+class RSSMState:
+    """A latent state or a sequence of them.
+
+    Attributes:
+        deter: d, (B, D) for one step or (B, T, D) for a sequence.
+        stoch: z, (B, S) or (B, T, S).
+    """
+
+    deter: Tensor
+    stoch: Tensor
+
+    @property
+    def latent(self) -> Tensor:
+        """s = [d, z], (B, D+S) or (B, T, D+S)."""
+        return torch.cat([self.deter, self.stoch], dim=-1)
+
+    def last(self) -> "RSSMState":
+        """The final step of a sequence, (B, ·)."""
+        return RSSMState(self.deter[:, -1], self.stoch[:, -1])
+
+    def detach(self) -> "RSSMState":
+        """The same state without its history of gradients."""
+        return RSSMState(self.deter.detach(), self.stoch.detach())
+
+
+@dataclass
+class DiagonalNormal:
+    """A diagonal Gaussian; mean and std are (..., S)."""
+
+    mean: Tensor
+    std: Tensor
+
+    def kl(self, other: "DiagonalNormal") -> Tensor:
+        """KL(self || other) in nats, summed over S: (...,)."""
+        variance_ratio = (self.std / other.std).square()
+        distance = ((self.mean - other.mean) / other.std).square()
+        return 0.5 * (variance_ratio + distance - 1 - variance_ratio.log()).sum(-1)
+
+
+class RSSM(nn.Module):
+    """Deterministic path, prior and posterior. All of it runs in float32: it is a few percent of the time."""
+
+    def __init__(self, config: RSSMConfig, embed_dim: int) -> None:
+        super().__init__()
+        hidden, deter, stoch = config.hidden_dim, config.deter_dim, config.stoch_dim
+        self.deter_dim, self.stoch_dim, self.min_std = deter, stoch, config.min_std
+        self.recurrent_input = nn.Linear(stoch + config.action_dim, hidden)
+        self.gru = nn.GRUCell(hidden, deter)
+        self.prior_hidden = nn.Linear(deter, hidden)
+        self.prior_params = nn.Linear(hidden, 2 * stoch)
+        self.posterior_hidden = nn.Linear(deter + embed_dim, hidden)
+        self.posterior_params = nn.Linear(hidden, 2 * stoch)
+
+    def initial_state(self, batch_size: int) -> RSSMState:
+        """The all-zero state every sequence starts from, (B, ·)."""
+        zeros = self.prior_params.weight.new_zeros
+        return RSSMState(zeros(batch_size, self.deter_dim), zeros(batch_size, self.stoch_dim))
+
+    def observe(
+        self, embeds: Tensor, prev_actions: Tensor, state: RSSMState, *, sample: bool
+    ) -> tuple[RSSMState, DiagonalNormal]:
+        """Filter a sequence: the posterior state at each step given images and actions up to it.
+
+        Args:
+            embeds: Image embeddings e_t, (B, T, E).
+            prev_actions: a_{t-1} at position t, (B, T, A).
+            state: s before the first step, (B, ·).
+            sample: Draw z_t from the posterior (training) or take its mean (filtering).
+
+        Returns:
+            The states (B, T, ·) and the posterior of each step, (B, T, S).
+        """
+        with torch.autocast(embeds.device.type, enabled=False):
+            # The parts of both linear layers that do not depend on the recurrence, for all T at once.
+            embeds, prev_actions = embeds.float(), prev_actions.float()
+            z_weight, a_weight = self.recurrent_input.weight.split(
+                [self.stoch_dim, prev_actions.shape[-1]], 1
+            )
+            d_weight, e_weight = self.posterior_hidden.weight.split([self.deter_dim, embeds.shape[-1]], 1)
+            from_action = F.linear(prev_actions, a_weight, self.recurrent_input.bias)  # (B, T, H)
+            from_embed = F.linear(embeds, e_weight, self.posterior_hidden.bias)  # (B, T, H)
+
+            d, z = state.deter, state.stoch
+            deters, stochs, means, stds = [], [], [], []
+            for step_action, step_embed in zip(from_action.unbind(1), from_embed.unbind(1), strict=True):
+                d = self.gru(F.elu(F.linear(z, z_weight) + step_action), d)  # (B, D)
+                hidden = F.elu(F.linear(d, d_weight) + step_embed)  # (B, H)
+                posterior = self._normal(self.posterior_params(hidden))  # (B, S)
+                z = posterior.mean
+                if sample:
+                    z = z + posterior.std * torch.randn_like(posterior.std)
+                deters.append(d)
+                stochs.append(z)
+                means.append(posterior.mean)
+                stds.append(posterior.std)
+            states = RSSMState(torch.stack(deters, 1), torch.stack(stochs, 1))
+            return states, DiagonalNormal(torch.stack(means, 1), torch.stack(stds, 1))
+
+    def prior(self, deter: Tensor) -> DiagonalNormal:
+        """The distribution of z_t before o_t is seen; deter is d_t, (..., D)."""
+        with torch.autocast(deter.device.type, enabled=False):
+            return self._normal(self.prior_params(F.elu(self.prior_hidden(deter))))
+
+    def imagine(self, state: RSSMState, actions: Tensor, *, sample: bool = False) -> RSSMState:
+        """Roll the prior forward without images.
+
+        Args:
+            state: s_t, (B, ·).
+            actions: a_t, a_{t+1}, ..., (B, H, A): the first is the one executed in `state`.
+            sample: Draw z from the prior instead of taking its mean.
+
+        Returns:
+            s_{t+1} ... s_{t+H}, (B, H, ·).
+        """
+        d, z = state.deter, state.stoch
+        deters, stochs = [], []
+        with torch.autocast(actions.device.type, enabled=False):
+            for action in actions.float().unbind(1):
+                d = self.gru(F.elu(self.recurrent_input(torch.cat([z, action], -1))), d)  # (B, D)
+                prior = self.prior(d)  # (B, S)
+                z = prior.mean + prior.std * torch.randn_like(prior.std) if sample else prior.mean
+                deters.append(d)
+                stochs.append(z)
+        return RSSMState(torch.stack(deters, 1), torch.stack(stochs, 1))
+
+    def _normal(self, params: Tensor) -> DiagonalNormal:
+        mean, std = params.chunk(2, dim=-1)
+        return DiagonalNormal(mean, F.softplus(std).clamp(min=self.min_std))

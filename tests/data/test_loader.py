@@ -1,0 +1,147 @@
+"""The RAM path serves what LeRobot's own DataLoader serves."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch.utils.data import DataLoader, Subset
+
+from lerobot_wm.data.cache import camera_frames
+from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.loader import RamDataset, RamLoader, gather
+
+CPU = torch.device("cpu")
+
+
+def windows(length: int, fps: int = 80) -> dict[str, list[float]]:
+    keys = ("observation.image", "observation.state", "action", "next.reward")
+    return {key: [i / fps for i in range(length)] for key in keys}
+
+
+def assert_equal_batches(dataset: LeRobotDataset | Subset, indices: list[int]) -> None:
+    loader = DataLoader(dataset, batch_size=4, sampler=indices)
+    ours = RamLoader(loader, loader.batch_sampler, CPU)
+    assert len(ours) == len(loader)
+    for theirs, batch in zip(loader, ours, strict=True):
+        assert theirs.keys() == batch.keys()
+        assert list(theirs.pop("task")) == batch.pop("task")
+        for key, value in theirs.items():
+            assert value.dtype == batch[key].dtype, key
+            assert torch.equal(value, batch[key]), key
+
+
+def some_indices(dataset: LeRobotDataset, step: int = 17) -> list[int]:
+    """Rows across the whole dataset, the last frames of episodes among them."""
+    ends = np.cumsum(dataset.meta.episodes["length"])[: dataset.num_episodes] - 1
+    return [*range(0, dataset.num_frames, step), *(end for end in ends.tolist() if end < dataset.num_frames)]
+
+
+def test_windows_equal_lerobots(demos_root: Path) -> None:
+    dataset = LeRobotDataset("test/demos", root=demos_root, delta_timestamps=windows(5), return_uint8=True)
+    assert_equal_batches(dataset, some_indices(dataset))
+
+
+def test_single_frames_equal_lerobots(demos_root: Path) -> None:
+    dataset = LeRobotDataset("test/demos", root=demos_root, return_uint8=True)
+    assert_equal_batches(dataset, some_indices(dataset))
+
+
+def test_chosen_episodes_and_subset_equal_lerobots(demos_root: Path) -> None:
+    dataset = LeRobotDataset(
+        "test/demos", root=demos_root, episodes=[1, 5], delta_timestamps=windows(3), return_uint8=True
+    )
+    assert_equal_batches(dataset, [0, 1, dataset.num_frames - 2, dataset.num_frames - 1])
+    assert_equal_batches(Subset(dataset, [3, 70, 9]), [0, 1, 2])
+
+
+def test_past_frames_and_uneven_deltas_equal_lerobots(demos_root: Path) -> None:
+    deltas = {"observation.state": [-2 / 80, 0.0], "action": [0.0, 3 / 80]}
+    dataset = LeRobotDataset("test/demos", root=demos_root, delta_timestamps=deltas, return_uint8=True)
+    assert_equal_batches(dataset, some_indices(dataset))
+
+
+def test_png_dataset_equals_lerobots(tmp_path: Path) -> None:
+    features = {
+        "observation.image": {
+            "dtype": "image",
+            "shape": (20, 24, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "observation.state": {"dtype": "float32", "shape": (3,), "names": None},
+        "action": {"dtype": "float32", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("test/png", 10, features, root=tmp_path / "png", use_videos=False)
+    rng = np.random.default_rng(0)
+    for length in (4, 6):
+        for _ in range(length):
+            dataset.add_frame(
+                {
+                    "observation.image": rng.integers(0, 256, (20, 24, 3), dtype=np.uint8),
+                    "observation.state": rng.random(3, dtype=np.float32),
+                    "action": rng.random(1, dtype=np.float32),
+                    "task": "look",
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    deltas = {"observation.image": [0.0, 0.1], "action": [0.0, 0.1]}
+    dataset = LeRobotDataset("test/png", root=tmp_path / "png", delta_timestamps=deltas)
+    assert_equal_batches(dataset, list(range(10)))
+
+
+def test_a_window_never_crosses_an_episode(demos_root: Path) -> None:
+    length = 25
+    dataset = LeRobotDataset("test/demos", root=demos_root, delta_timestamps=windows(length))
+    source = RamDataset(dataset, CPU)
+    frame_of_row = source._columns["frame_index"]
+    batch = source.batch(list(range(dataset.num_frames)))
+    frames_left = torch.tensor(dataset.meta.episodes["length"])[batch["episode_index"]] - frame_of_row
+    assert torch.equal((~batch["action_is_pad"]).sum(1), frames_left.clamp(max=length))
+    # whatever is padded repeats the episode's last action
+    last = batch["action"][:, -1]
+    padded = batch["action_is_pad"][:, -1]
+    next_rows = (torch.arange(dataset.num_frames) + frames_left - 1)[padded]
+    assert torch.equal(last[padded], source._columns["action"][next_rows])
+
+
+def test_frames_are_decoded_once_and_decoding_resumes(demos_root: Path) -> None:
+    dataset = LeRobotDataset("test/demos", root=demos_root)
+    first = camera_frames(dataset, "observation.image").clone()
+    folder = next(demos_root.with_name("dataset.cache").glob("frames-*"))
+    stored = np.load(folder / "observation.image.npy", mmap_mode="r+")
+    marks = np.load(folder / "observation.image.decoded.npy", mmap_mode="r+")
+    stop = dataset.meta.episodes[0]["dataset_to_index"]
+    stored[:] = 7  # a second decoding would restore every frame
+    marks[0] = 0  # as after a kill before the first episode was marked
+    stored.flush(), marks.flush()
+    again = camera_frames(dataset, "observation.image")
+    assert torch.equal(again[:stop], first[:stop])
+    assert (again[stop:] == 7).all()
+    stored[:] = first.numpy()
+    stored.flush()
+
+
+def test_fingerprint_changes_with_content(demos_root: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(demos_root, copy)
+    assert dataset_fingerprint(copy) == dataset_fingerprint(demos_root)
+    stats = copy / "meta" / "stats.json"
+    stats.write_text(stats.read_text().replace("0", "1", 1))
+    assert dataset_fingerprint(copy) != dataset_fingerprint(demos_root)
+
+
+def test_slices_equal_fancy_indexing() -> None:
+    source = torch.arange(60).reshape(20, 3)
+    runs = torch.tensor([[0, 1, 2], [17, 18, 19]])
+    repeats = torch.tensor([[0, 0, 1], [5, 4, 3]])
+    for index in (runs, repeats, torch.tensor([3, 1])):
+        assert torch.equal(gather(source, index), source[index])
+
+
+def test_image_transforms_are_refused(demos_root: Path) -> None:
+    dataset = LeRobotDataset("test/demos", root=demos_root, image_transforms=torch.nn.Identity())
+    with pytest.raises(ValueError, match="image_transforms"):
+        RamDataset(dataset, CPU)

@@ -1,0 +1,87 @@
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_wm.envs import rendering
+from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
+
+MakeEnv = Callable[..., MetaworldMTEnv]
+TASKS = ("reach-v3", "door-open-v3", "window-close-v3")
+FIRST_IMAGE = """
+import sys, numpy as np
+from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
+np.save(sys.argv[2], MetaworldMTEnv(sys.argv[1]).reset(seed=5)[0]["pixels"])
+"""
+
+
+def test_tasks_in_one_process_do_not_disturb_each_other(make_env: MakeEnv, tmp_path: Path) -> None:
+    """A task's image is the same before others are drawn, after, and alone; nothing is said at exit."""
+    first = make_env(TASKS[0])
+    before = first.reset(seed=5)[0]["pixels"]
+    others = [make_env(task).reset(seed=5)[0]["pixels"] for task in TASKS[1:]]
+    np.testing.assert_array_equal(before, first.reset(seed=5)[0]["pixels"])
+    command = [sys.executable, "-c", FIRST_IMAGE, TASKS[1], str(tmp_path / "alone.npy")]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (0, "")
+    np.testing.assert_array_equal(others[0], np.load(tmp_path / "alone.npy"))
+
+
+def test_sub_environments_share_one_renderer(make_env: MakeEnv) -> None:
+    envs = [make_env("reach-v3") for _ in range(4)]
+    for k, env in enumerate(envs):
+        env.reset(seed=k)
+    assert [renderer.users for renderer in rendering._renderers.values()] == [4]
+    images = [env.step(np.zeros(4))[0]["pixels"] for env in envs]
+    assert len({image.tobytes() for image in images}) == 4  # four goals
+    for env in envs:
+        env.close()
+    assert rendering._renderers == {}
+
+
+def test_threads_may_render(make_env: MakeEnv) -> None:
+    """LeRobot's --env.max_parallel_tasks evaluates tasks in threads and closes them in another one."""
+    envs = [make_env(task) for task in TASKS]
+    alone = [env.reset(seed=1)[0]["pixels"] for env in envs]
+    with ThreadPoolExecutor(len(envs)) as pool:
+        for _ in range(3):
+            threaded = list(pool.map(lambda env: env.reset(seed=1)[0]["pixels"], envs))
+            np.testing.assert_array_equal(alone, threaded)
+
+
+def test_picture_is_lerobots(make_env: MakeEnv) -> None:
+    """Camera, orientation and light are those of LeRobot's metaworld environment; only shadows are gone."""
+    from lerobot.envs.metaworld import MetaworldEnv
+
+    theirs_env = MetaworldEnv("door-open-v3", obs_type="pixels_agent_pos")
+    theirs = theirs_env.reset(seed=0)[0]["pixels"].reshape(60, 8, 60, 8, 3).mean(axis=(1, 3))
+    theirs_env.close()
+    ours = make_env("door-open-v3", image_size=480).reset(seed=0)[0]["pixels"]
+    ours = ours.reshape(60, 8, 60, 8, 3).mean(axis=(1, 3))
+    assert np.abs(ours - theirs).mean() < 12
+    assert np.abs(ours[::-1] - theirs).mean() > 30
+    assert np.abs(ours[:, ::-1] - theirs).mean() > 30
+
+
+@pytest.mark.parametrize("camera_name", ["corner", "topview", "gripperPOV"])
+def test_cameras_and_slow_rendering(make_env: MakeEnv, camera_name: str) -> None:
+    fast = make_env("drawer-open-v3", camera_name=camera_name, image_size=96).reset(seed=0)[0]["pixels"]
+    slow_env = make_env("drawer-open-v3", camera_name=camera_name, image_size=96, fast_rendering=False)
+    slow = slow_env.reset(seed=0)[0]["pixels"]
+    assert fast.shape == slow.shape == (96, 96, 3)
+    difference = np.abs(fast.astype(int) - slow).mean()
+    assert 0.1 < difference < 30
+
+
+def test_missing_gl_says_what_to_install() -> None:
+    code = "from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv; MetaworldMTEnv('reach-v3').reset(seed=0)"
+    # EGL without any device to draw on, as on a machine without Mesa's drivers.
+    env = {**os.environ, "MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "99"}
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert result.returncode == 1
+    assert "apt-get install -y --no-install-recommends libegl1 libgl1" in result.stderr.splitlines()[-2]

@@ -1,0 +1,95 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_wm.constants import MT6, MT10
+from lerobot_wm.envs import variations
+from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
+from lerobot_wm.envs.tasks import all_tasks, expert_name, resolve_tasks, task_description, task_id
+
+
+def test_task_sets() -> None:
+    assert resolve_tasks("mt6") == MT6
+    assert resolve_tasks("mt10") == MT10
+    assert len(set(resolve_tasks("mt50"))) == 50
+    assert resolve_tasks("reach-v3, mt6,reach-v3")[:2] == ("reach-v3", "button-press-topdown-v3")
+    assert len(resolve_tasks("reach-v3,mt6")) == 6
+
+
+@pytest.mark.parametrize(
+    ("spec", "hint"),
+    [("reach-v2", "reach-v3"), ("mt60", "mt6"), ("drawer-opn-v3", "drawer-open-v3"), (" , ", "mt50")],
+)
+def test_unknown_task_names_what_exists(spec: str, hint: str) -> None:
+    with pytest.raises(ValueError, match=hint):
+        resolve_tasks(spec)
+
+
+def test_names_equal_lerobots() -> None:
+    import metaworld
+    from lerobot.envs import metaworld as lerobot_metaworld
+
+    assert set(all_tasks()) == set(metaworld.ALL_V3_ENVIRONMENTS)
+    for task in all_tasks():
+        assert task_description(task) == lerobot_metaworld.TASK_DESCRIPTIONS[task]
+        assert task_id(task) == lerobot_metaworld.TASK_NAME_TO_ID[task]
+        assert expert_name(task) == lerobot_metaworld.TASK_POLICY_MAPPING[task].__name__
+    shared = [task for task in all_tasks() if task_description(task) == task_description("push-v3")]
+    assert sorted(shared) == ["push-back-v3", "push-v3"]
+
+
+def test_variations_are_metaworlds_own() -> None:
+    import pickle
+
+    import metaworld
+
+    tasks = metaworld.MT1("window-close-v3", seed=42).train_tasks
+    for k, task in enumerate(tasks):
+        ours = variations.rand_vec("window-close-v3", k)
+        np.testing.assert_array_equal(ours, pickle.loads(task.data)["rand_vec"])
+
+
+def test_variations_are_complete_and_distinct() -> None:
+    data = json.loads(variations.VARIATIONS_PATH.read_bytes())["sets"]["42"]
+    assert set(data) == set(all_tasks())
+    for vectors in data.values():
+        assert len({tuple(vector) for vector in vectors}) == 50
+
+
+def test_changed_variations_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    changed = tmp_path / "variations.json"
+    changed.write_text(variations.VARIATIONS_PATH.read_text().replace("0.1", "0.2", 1))
+    monkeypatch.setattr(variations, "VARIATIONS_PATH", changed)
+    variations._load.cache_clear()
+    with pytest.raises(ValueError, match="SHA-256"):
+        variations.rand_vec("reach-v3", 0)
+    variations._load.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("task", "reach", "reach-v3"),
+        ("split", "train", "all, seen, unseen"),
+        ("camera_name", "corner4", "corner"),
+        ("episode_length", 501, "1 to 500"),
+        ("image_size", 8, "at least 16"),
+        ("obs_type", "state", "pixels_agent_pos"),
+    ],
+)
+def test_config_refuses(field: str, value: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        MetaworldMTEnvConfig(**{field: value})
+
+
+def test_config_imports_no_simulator() -> None:
+    code = (
+        "import sys, lerobot_wm.envs.configuration as c; c.MetaworldMTEnvConfig(task='mt50');"
+        "sys.exit(str([m for m in ('mujoco', 'metaworld') if m in sys.modules] or ''))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.stderr.strip() == ""

@@ -1,0 +1,4 @@
+"""Command-line flags that many tests share."""
+
+DATASET_FLAGS = "--dataset.repo_id=test/demos --dataset.root={root}"
+TRAIN_FLAGS = "--policy.push_to_hub=false --policy.device=cpu --seed=0 --num_workers=0"

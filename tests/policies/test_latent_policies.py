@@ -1,0 +1,259 @@
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import get_policy_class
+from lerobot.scripts import lerobot_train
+from safetensors.torch import load_file
+from torch import Tensor
+
+from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
+from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
+
+POLICY_TYPES = ("wm_bc", "wm_iql")
+
+
+def load(policy_paths: dict[str, Path], policy_type: str) -> LatentPolicy:
+    return get_policy_class(policy_type).from_pretrained(policy_paths[policy_type])
+
+
+def frame(demos: LeRobotDataset, index: int) -> dict:
+    item = demos[index]
+    keys = ("observation.image", "observation.state")
+    return {**{key: item[key][None] for key in keys}, "task": [item["task"]]}
+
+
+def replay(policy: LatentPolicy, demos: LeRobotDataset, episode: int) -> Tensor:
+    """s_t as the policy's own filter sees an episode, step by step, with the demonstrated actions executed."""
+    rows = demos.meta.episodes[episode]
+    policy.reset()
+    latents = []
+    for index in range(rows["dataset_from_index"], rows["dataset_to_index"]):
+        policy.select_action(frame(demos, index))
+        policy._prev_action = demos[index]["action"][None]
+        latents.append(policy._filter_state.latent[0])
+    return torch.stack(latents)
+
+
+def test_step_by_step_latents_equal_the_encoded_ones(
+    demos: LeRobotDataset, latents_root: Path, policy_paths: dict[str, Path]
+) -> None:
+    encoded = LeRobotDataset("test/latents", root=latents_root)
+    policy = load(policy_paths, "wm_bc")
+    first = replay(policy, demos, 0)
+    second = replay(policy, demos, 5)  # after another episode: nothing of it may remain
+    for episode, latents in ((0, first), (5, second)):
+        rows = encoded.meta.episodes[episode]
+        stored = torch.stack(
+            encoded.hf_dataset["observation.latent"][rows["dataset_from_index"] : rows["dataset_to_index"]]
+        )
+        torch.testing.assert_close(latents, stored, atol=2e-5, rtol=2e-5)
+
+
+def test_latent_dataset_keeps_everything_but_the_images(demos: LeRobotDataset, latents_root: Path) -> None:
+    encoded = LeRobotDataset("test/latents", root=latents_root)
+    assert encoded.meta.camera_keys == []
+    assert encoded.meta.features["observation.latent"]["shape"] == (512,)
+    assert set(demos.features) - set(encoded.features) == {"observation.image"}
+    for index in (0, 100, demos.num_frames - 1):
+        ours, theirs = encoded[index], demos[index]
+        for key in ours.keys() - {"observation.latent", "task"}:
+            assert torch.equal(ours[key], theirs[key]), key
+        assert ours["task"] == theirs["task"]
+    record = LatentRecord.read(latents_root)
+    assert record.tasks == ["Reach a goal position", "Push and close a window"]
+    assert not record.sampled
+
+
+@pytest.mark.parametrize("policy_type", POLICY_TYPES)
+def test_checkpoint_is_self_contained(
+    policy_type: str,
+    policy_paths: dict[str, Path],
+    world_model_path: Path,
+    demos: LeRobotDataset,
+    tmp_path: Path,
+) -> None:
+    copy = tmp_path / "elsewhere"
+    shutil.copytree(policy_paths[policy_type], copy)
+    config = copy / "config.json"
+    config.write_text(config.read_text().replace(str(world_model_path), "gone"))
+    policy = get_policy_class(policy_type).from_pretrained(copy)
+    actions = policy.select_action(frame(demos, 0))
+    assert actions.shape == (1, 4)
+    assert (actions.abs() <= 1 + 1e-6).all()
+    assert not policy.world_model.training
+    weights = load_file(world_model_path / "model.safetensors")
+    for name, tensor in policy.world_model.state_dict().items():
+        assert torch.equal(tensor, weights[f"world_model.{name}"]), name
+
+
+@pytest.mark.parametrize("policy_type", POLICY_TYPES)
+def test_a_second_episode_equals_a_fresh_one(
+    policy_type: str, policy_paths: dict[str, Path], demos: LeRobotDataset
+) -> None:
+    policy = load(policy_paths, policy_type)
+
+    def act() -> Tensor:
+        policy.reset()
+        return torch.cat([policy.select_action(frame(demos, index)) for index in range(5)])
+
+    first = act()
+    assert torch.equal(first, act())
+    assert first.unique(dim=0).shape[0] == 5
+
+
+@pytest.mark.parametrize("policy_type", POLICY_TYPES)
+def test_actions_do_not_depend_on_the_batch(
+    policy_type: str, policy_paths: dict[str, Path], demos: LeRobotDataset
+) -> None:
+    policy = load(policy_paths, policy_type)
+    frames = [[frame(demos, start + t) for t in range(4)] for start in (0, 60, 300)]
+    alone = []
+    for episode in frames:
+        policy.reset()
+        alone.append(torch.cat([policy.select_action(step) for step in episode]))
+    policy.reset()
+    together = []
+    for t in range(4):
+        steps = [episode[t] for episode in frames]
+        batch = {
+            key: torch.cat([step[key] for step in steps])
+            for key in ("observation.image", "observation.state")
+        }
+        together.append(policy.select_action({**batch, "task": [step["task"][0] for step in steps]}))
+    torch.testing.assert_close(torch.stack(together, 1), torch.stack(alone), atol=1e-5, rtol=1e-4)
+
+
+def test_only_the_policys_own_networks_are_trained(policy_paths: dict[str, Path]) -> None:
+    for policy_type in POLICY_TYPES:
+        policy = load(policy_paths, policy_type)
+        assert not any(
+            name.startswith("world_model") for name, p in policy.named_parameters() if p.requires_grad
+        )
+
+
+def test_iql_targets_follow_the_critics(policy_paths: dict[str, Path]) -> None:
+    policy = load(policy_paths, "wm_iql")
+    assert isinstance(policy, WMIQLPolicy)
+    pairs = list(zip(policy.target_critic.parameters(), policy.critic.parameters(), strict=True))
+    assert any(not torch.equal(target, source) for target, source in pairs)  # they lag after 20 steps
+    before = [target.clone() for target, _ in pairs]
+    policy.update()
+    for old, (target, source) in zip(before, pairs, strict=True):
+        torch.testing.assert_close(target, old + policy.config.target_rate * (source - old))
+
+
+def test_training_on_images_encodes_them_first(
+    demos_root: Path,
+    latents_root: Path,
+    world_model_path: Path,
+    policy_paths: dict[str, Path],
+    tmp_path: Path,
+    lerobot_wm_command: Callable[..., None],
+) -> None:
+    lerobot_wm_command(
+        f"train --policy.type=wm_bc --policy.world_model_path={world_model_path} --steps=20 --batch_size=32",
+        f"--log_freq=10 --save_freq=10 {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)}",
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    cached = list(demos_root.with_name("dataset.cache").glob("latents-*"))
+    assert len(cached) == 1
+    assert LatentRecord.read(cached[0]) == LatentRecord.read(latents_root)
+    # the same latents in the same order give the same policy as training on the encoded dataset
+    ours = load_file(tmp_path / "run" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors")
+    for name, tensor in load_file(policy_paths["wm_bc"] / "model.safetensors").items():
+        assert torch.equal(tensor, ours[name]), name
+
+
+def test_plain_lerobot_train_on_latents(
+    latents_root: Path, world_model_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = (
+        f"--policy.type=wm_iql --policy.world_model_path={world_model_path} --steps=2 --batch_size=8 {TRAIN_FLAGS} "
+        f"--dataset.repo_id=test/latents --dataset.root={latents_root} --output_dir={tmp_path / 'run'}"
+    )
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags.split()])
+    lerobot_train.main()
+    WMIQLPolicy.from_pretrained(tmp_path / "run" / "checkpoints" / "last" / "pretrained_model")
+
+
+def test_blind_control_reads_no_image(
+    latents_root: Path, demos: LeRobotDataset, tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    lerobot_wm_command(
+        f"train --policy.type=wm_bc --policy.use_latent=false --steps=5 --batch_size=8 {TRAIN_FLAGS}",
+        f"--dataset.repo_id=test/latents --dataset.root={latents_root} --output_dir={tmp_path / 'run'}",
+    )
+    checkpoint = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    policy = get_policy_class("wm_bc").from_pretrained(checkpoint)
+    seen = frame(demos, 0)
+    action = policy.select_action(seen)
+    assert torch.equal(action, policy.select_action({**seen, "observation.image": torch.zeros(1, 3, 9, 9)}))
+    assert (checkpoint / "model.safetensors").stat().st_size < 1_000_000
+
+
+def test_unknown_task(policy_paths: dict[str, Path], demos: LeRobotDataset) -> None:
+    policy = load(policy_paths, "wm_bc")
+    with pytest.raises(ValueError, match=r"Unknown task \['Juggle'\].*Reach a goal position"):
+        policy.select_action({**frame(demos, 0), "task": ["Juggle"]})
+
+
+def test_other_image_size(policy_paths: dict[str, Path], demos: LeRobotDataset) -> None:
+    policy = load(policy_paths, "wm_bc")
+    with pytest.raises(ValueError, match=r"\(3, 96, 96\).*\(3, 64, 64\).*--env\.image_size=64"):
+        policy.select_action({**frame(demos, 0), "observation.image": torch.zeros(1, 3, 96, 96)})
+
+
+def test_other_action_size(policy_paths: dict[str, Path]) -> None:
+    config = load(policy_paths, "wm_bc").config
+    config.output_features["action"].shape = (7,)
+    with pytest.raises(ValueError, match=r"4-d actions.*7-d"):
+        config.validate_features()
+
+
+def refused(flags: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The error `lerobot-train` ends with on these flags, before any training."""
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags.split(), "--steps=1", *TRAIN_FLAGS.split()])
+    with pytest.raises(ValueError) as error:  # noqa: PT011 - the callers look at the message
+        lerobot_train.main()
+    return str(error.value)
+
+
+def test_latents_of_another_world_model(
+    latents_root: Path, world_model_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    earlier = world_model_path.parents[1].parent / "checkpoints" / "000006" / "pretrained_model"
+    message = refused(
+        f"--policy.type=wm_bc --policy.world_model_path={earlier} --dataset.repo_id=test/latents "
+        f"--dataset.root={latents_root} --output_dir={tmp_path / 'run'}",
+        monkeypatch,
+    )
+    assert "were encoded by world model" in message
+
+
+def test_images_without_latents(
+    demos_root: Path, world_model_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    message = refused(
+        f"--policy.type=wm_bc --policy.world_model_path={world_model_path} {DATASET_FLAGS.format(root=demos_root)} "
+        f"--output_dir={tmp_path / 'run'}",
+        monkeypatch,
+    )
+    assert "lerobot-wm encode" in message
+
+
+def test_policy_without_a_world_model(
+    latents_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    message = refused(
+        f"--policy.type=wm_bc --dataset.repo_id=test/latents --dataset.root={latents_root} "
+        f"--output_dir={tmp_path / 'run'}",
+        monkeypatch,
+    )
+    assert "--policy.world_model_path" in message

@@ -1,0 +1,128 @@
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.scripts import lerobot_train
+from safetensors.torch import load_file, save_file
+
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy, resize_images
+from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
+
+SHORT = "--policy.type=wm_rssm --steps=2 --batch_size=2 --log_freq=1 --policy.window_length=4"
+
+
+def test_losses_are_logged_by_name(world_model_path: Path) -> None:
+    log = world_model_path.parents[2] / "train_log.jsonl"
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [line["step"] for line in lines] == [4, 8, 12]
+    assert {"loss", "image_loss", "reward_loss", "kl_loss", "kl", "under_free_nats"} <= lines[0].keys()
+    assert lines[-1]["image_loss"] < lines[0]["image_loss"]
+
+
+def test_checkpoint_round_trip(world_model_path: Path) -> None:
+    policy = WMRSSMPolicy.from_pretrained(world_model_path)
+    stored = load_file(world_model_path / "model.safetensors")
+    assert all(torch.equal(tensor, stored[name]) for name, tensor in policy.state_dict().items())
+    assert policy.config.rssm.action_dim == 4
+    assert policy.config.image_key == "observation.image"
+
+
+def test_resume_is_exact(
+    world_model_path: Path, tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    """A run cut off after its first checkpoint and resumed ends with the weights of the undisturbed run."""
+    run_folder = tmp_path / "run"
+    shutil.copytree(world_model_path.parents[1], run_folder / "checkpoints", symlinks=True)
+    shutil.rmtree(run_folder / "checkpoints" / "000012")
+    config = run_folder / "checkpoints" / "000006" / "pretrained_model" / "train_config.json"
+    lerobot_wm_command(f"train --config_path={config} --resume=true --output_dir={run_folder}")
+    resumed = load_file(run_folder / "checkpoints" / "000012" / "pretrained_model" / "model.safetensors")
+    for name, tensor in load_file(world_model_path / "model.safetensors").items():
+        assert torch.equal(tensor, resumed[name]), name
+
+
+def test_plain_lerobot_train_takes_the_same_flags(
+    demos_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = f"{SHORT} {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)} --output_dir={tmp_path / 'run'}"
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags.split()])
+    lerobot_train.main()
+    policy = WMRSSMPolicy.from_pretrained(tmp_path / "run" / "checkpoints" / "last" / "pretrained_model")
+    assert policy.config.window_length == 4
+
+
+def test_held_out_loss(
+    demos_root: Path,
+    tmp_path: Path,
+    lerobot_wm_command: Callable[..., None],
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    lerobot_wm_command(
+        f"train {SHORT} {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)} --dataset.eval_split=0.25",
+        f"--eval_steps=2 --max_eval_samples=8 --output_dir={tmp_path / 'run'}",
+    )
+    assert "eval_loss=" in capfd.readouterr().err
+
+
+def test_proprioceptive_variant_trains(
+    demos_root: Path, tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    lerobot_wm_command(
+        f"train {SHORT} {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)}",
+        f"--policy.rssm.use_proprio=true --output_dir={tmp_path / 'run'}",
+    )
+    log = (tmp_path / "run" / "train_log.jsonl").read_text().splitlines()
+    assert json.loads(log[-1])["proprio_loss"] > 0
+
+
+def test_a_world_model_chooses_no_actions(world_model_path: Path) -> None:
+    with pytest.raises(NotImplementedError, match="wm_bc"):
+        WMRSSMPolicy.from_pretrained(world_model_path).select_action({})
+
+
+def test_several_cameras_ask_for_a_choice(demos: LeRobotDataset, world_model_path: Path) -> None:
+    config = WMRSSMPolicy.from_pretrained(world_model_path).config
+    config.input_features["observation.images.wrist"] = config.input_features["observation.image"]
+    config.image_key = None
+    with pytest.raises(ValueError, match=r"observation\.images\.wrist.*--policy\.image_key"):
+        config.validate_features()
+
+
+def test_other_action_size_is_refused(world_model_path: Path) -> None:
+    config = WMRSSMPolicy.from_pretrained(world_model_path).config
+    config.output_features["action"].shape = (7,)
+    with pytest.raises(ValueError, match="action_dim 4, here it is 7"):
+        config.validate_features()
+
+
+@pytest.mark.parametrize("fault", ["missing key", "extra key", "NaN", "cut short"])
+def test_broken_checkpoints_are_refused(world_model_path: Path, tmp_path: Path, fault: str) -> None:
+    broken = tmp_path / "checkpoint"
+    shutil.copytree(world_model_path, broken)
+    weights = broken / "model.safetensors"
+    tensors = load_file(weights)
+    name = "world_model.rssm.gru.weight_ih"
+    if fault == "missing key":
+        del tensors[name]
+    elif fault == "extra key":
+        tensors["world_model.surprise"] = torch.zeros(1)
+    elif fault == "NaN":
+        tensors[name][0, 0] = float("nan")
+    save_file(tensors, weights)
+    if fault == "cut short":
+        weights.write_bytes(weights.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="NaN or Inf" if fault == "NaN" else "does not fit"):
+        WMRSSMPolicy.from_pretrained(broken)
+
+
+def test_larger_images_are_averaged_down() -> None:
+    images = torch.rand(2, 5, 3, 128, 192)
+    small = resize_images(images)
+    assert small.shape == (2, 5, 3, 64, 64)
+    torch.testing.assert_close(small[0, 0, 0, 0, 0], images[0, 0, 0, :2, :3].mean())
+    assert resize_images(small) is small

@@ -1,0 +1,68 @@
+"""Open-loop prediction with a real (untrained) world model on real frames."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+
+from lerobot_wm.constants import ACTION, OBS_IMAGE
+from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model, open_loop, strips_figure
+
+
+@torch.no_grad()
+def test_imagination_follows_the_episodes_actions(world_model_path: Path, episodes_root: Path) -> None:
+    """Equal to one step at a time: frame t is reached by the action executed at frame t - 1."""
+    policy = load_world_model(str(world_model_path))
+    results = open_loop(policy, "test/episodes", str(episodes_root))
+    assert [(result.task, result.n_episodes) for result in results] == [
+        ("Reach a goal position", 1),
+        ("Push and close a window", 1),
+    ]
+
+    frames = [LeRobotDataset("test/episodes", root=episodes_root)[i] for i in range(WINDOW)]
+    model, state, previous = policy.world_model, None, torch.zeros(1, 1, 4)
+    for frame in frames[:CONTEXT]:
+        state = model.observe(frame[OBS_IMAGE][None, None], previous, state).last()
+        previous = frame[ACTION][None, None]
+    errors, copy_errors = [], []
+    for t in range(CONTEXT, WINDOW):
+        state = model.imagine(state, frames[t - 1][ACTION][None, None]).last()
+        image = model.decode(state.latent)[0]
+        torch.testing.assert_close(
+            torch.from_numpy(results[0].imagined[t - CONTEXT]), image, atol=1e-5, rtol=0
+        )
+        np.testing.assert_array_equal(results[0].truth[t], frames[t][OBS_IMAGE])
+        errors.append(float((image - frames[t][OBS_IMAGE]).square().mean()))
+        copy_errors.append(float((frames[CONTEXT - 1][OBS_IMAGE] - frames[t][OBS_IMAGE]).square().mean()))
+    for psnr, all_errors in ((results[0].psnr, errors), (results[0].copy_psnr, copy_errors)):
+        assert psnr == pytest.approx([-10 * np.log10(all_errors[h - 1]) for h in HORIZONS], abs=1e-3)
+
+
+def test_strips_show_truth_above_imagination(world_model_path: Path, episodes_root: Path) -> None:
+    results = open_loop(load_world_model(str(world_model_path)), "test/episodes", str(episodes_root))
+    axes = np.array(strips_figure(results).axes).reshape(2 * len(results), -1)
+    shown = axes[2, 3].images[0].get_array()
+    np.testing.assert_array_equal(shown, results[1].truth[CONTEXT - 1 + HORIZONS[2]].transpose(1, 2, 0))
+    shown = axes[3, 3].images[0].get_array()
+    np.testing.assert_array_equal(shown, results[1].imagined[HORIZONS[2] - 1].transpose(1, 2, 0))
+
+
+def test_a_checkpoint_without_a_world_model_is_refused(world_model_path: Path, tmp_path: Path) -> None:
+    features = PreTrainedConfig.from_pretrained(world_model_path)
+    config = ACTConfig(
+        input_features=features.input_features,
+        output_features=features.output_features,
+        dim_model=16,
+        n_heads=2,
+        pretrained_backbone_weights=None,
+        device="cpu",
+        push_to_hub=False,
+    )
+    ACTPolicy(config).save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=r"\(act\) holds no world model"):
+        load_world_model(str(tmp_path))

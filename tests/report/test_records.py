@@ -1,0 +1,49 @@
+"""Reading records files, and what is refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lerobot_wm.report.records import find_records, read_records
+
+
+def test_lists_and_globs(tmp_path: Path) -> None:
+    for name in ("b/records.jsonl", "a/records.jsonl", "c.jsonl"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = find_records(f"{tmp_path}/c.jsonl, {tmp_path}/*/records.jsonl,{tmp_path}/a/records.jsonl")
+    assert [str(path.relative_to(tmp_path)) for path in found] == [
+        "c.jsonl",
+        "a/records.jsonl",
+        "b/records.jsonl",
+    ]
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        find_records(f"{tmp_path}/nothing*.jsonl")
+
+
+def test_a_repeated_rollout_is_refused(records_file: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.jsonl"
+    again.write_text(records_file.read_text().splitlines()[3] + "\n")
+    with pytest.raises(ValueError, match=r"again\.jsonl:1 repeats .*'reach-v3', 3.*records\.jsonl:4"):
+        read_records([records_file, again])
+
+
+def test_lines_that_are_not_records_are_named(records_file: Path) -> None:
+    good = records_file.read_text().splitlines()[0]
+    without_steps = json.loads(good)
+    del without_steps["steps"]
+    for bad, message in (
+        (good[:30], "is not JSON"),
+        (json.dumps(without_steps), "expected the keys"),
+        ("[]", "list"),
+    ):
+        records_file.write_text(f"{good}\n{bad}\n")
+        with pytest.raises(ValueError, match=rf"records\.jsonl:2 .*{message}"):
+            read_records([records_file])
+
+
+def test_empty_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "records.jsonl").touch()
+    with pytest.raises(ValueError, match="empty"):
+        read_records([tmp_path / "records.jsonl"])

@@ -1,0 +1,63 @@
+"""`lerobot-wm doctor`: what it says of this machine, and of broken ones."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from lerobot_wm.pipeline import doctor
+
+
+def test_command_reports_every_part_and_fits_the_terminal(tmp_path: Path) -> None:
+    environment = {**os.environ, "COLUMNS": "100", "MUJOCO_GL": "egl", "HF_HOME": str(tmp_path)}
+    command = [str(Path(sys.executable).with_name("lerobot-wm")), "doctor"]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert max(map(len, run.stdout.splitlines())) <= 100
+    for part in ("Python", "mujoco", "rendering", "LeRobot plug-in", "CPU", "GPU", "Hub login", "disk"):
+        assert part in run.stdout
+    assert "mend:" not in run.stdout
+    assert "none; to push: hf auth login" in run.stdout
+
+
+def test_a_gl_backend_that_cannot_render_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "no_such_backend")
+    check = doctor.check_rendering()
+    assert check.is_broken
+    assert "no_such_backend" in check.found
+    assert "apt-get install" in check.verdict
+
+
+@pytest.mark.parametrize("version", ["3.17.0", "4.0.0"])
+def test_mujoco_that_breaks_metaworld_is_reported(version: str) -> None:
+    installed = {**doctor.installed_versions(), "mujoco": version}
+    [broken] = [check for check in doctor.check_packages(installed) if check.is_broken]
+    assert broken.name == "mujoco"
+    assert version in broken.found
+    assert "<3.17" in broken.mend
+
+
+def test_leftovers_of_mujoco_4_are_reported() -> None:
+    installed = {**doctor.installed_versions(), "mujoco-core": "4.0.0"}
+    [broken] = [check for check in doctor.check_packages(installed) if check.is_broken]
+    assert broken.found == "mujoco-core"
+    assert "pip uninstall -y mujoco-core" in broken.mend
+
+
+def test_missing_package_is_reported() -> None:
+    check = doctor.check_requirement(Requirement("metaworld==3.0.0"), {})
+    assert check.verdict == "mend: pip install 'metaworld==3.0.0'"
+
+
+def test_full_disk_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(doctor, "MIN_FREE_GB", 1e9)
+    assert doctor.check_disk("disk", tmp_path / "not" / "there").is_broken
+
+
+def test_optional_parts_never_fail_the_command() -> None:
+    check = doctor.Check("GPU", "driver too old", "update it", needed=False)
+    assert check.verdict == "mend: update it"
+    assert not check.is_broken

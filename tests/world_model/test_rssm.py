@@ -1,0 +1,176 @@
+"""The classic errors of recurrent world models, each caught by one test."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from lerobot_wm.world_model.config import RSSMConfig
+from lerobot_wm.world_model.losses import world_model_loss
+from lerobot_wm.world_model.model import WorldModel
+from lerobot_wm.world_model.rssm import DiagonalNormal
+
+ACTION_DIM = 2
+SMALL = {"deter_dim": 32, "stoch_dim": 8, "hidden_dim": 32, "reward_hidden_dim": 32}
+
+
+def make_world_model(**changes) -> WorldModel:
+    torch.manual_seed(0)
+    return WorldModel(RSSMConfig(**{**SMALL, "image_channels": 3, "action_dim": ACTION_DIM, **changes}))
+
+
+def two_lamps(batch: int, steps: int, seed: int) -> tuple[Tensor, Tensor]:
+    """A toy environment: a_t turns two lamps, the halves of the image, up or down before o_{t+1} is seen."""
+    generator = torch.Generator().manual_seed(seed)
+    actions = torch.rand(batch, steps, ACTION_DIM, generator=generator) * 2 - 1
+    brightness = torch.rand(batch, ACTION_DIM, generator=generator)
+    frames = torch.empty(batch, steps, 3, 64, 64)
+    for t in range(steps):
+        frames[:, t, :, :, :32] = brightness[:, 0, None, None, None]
+        frames[:, t, :, :, 32:] = brightness[:, 1, None, None, None]
+        brightness = (brightness + 0.4 * actions[:, t]).clamp(0, 1)
+    return frames, actions
+
+
+@pytest.fixture(scope="module")
+def trained() -> WorldModel:
+    """A small model trained on the two lamps until it can predict them."""
+    model = make_world_model(predict_reward=False, free_nats=0.1, kl_scale=5.0)
+    optimizer = torch.optim.Adam(model.parameters(), 2e-3, fused=True)
+    valid = torch.ones(8, 8, dtype=torch.bool)
+    for step in range(150):
+        images, actions = two_lamps(8, 8, seed=step)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            loss, _ = model.loss(images, actions, valid)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return model.eval()
+
+
+@torch.no_grad()
+def prediction_error(model: WorldModel, shift: int) -> float:
+    """Squared error of frames imagined from 4 context frames under actions shifted by `shift` steps."""
+    images, actions = two_lamps(64, 12, seed=10_000)
+    context, horizon = 4, 4
+    state = model.filter(images[:, :context], actions[:, :context]).last()
+    first = context - 1 + shift  # the first action of `imagine` is the one executed in the last context frame
+    imagined = model.decode(model.imagine(state, actions[:, first : first + horizon]).latent)
+    return (imagined - images[:, context : context + horizon]).square().mean().item()
+
+
+def test_prediction_needs_the_action_of_the_same_step(trained: WorldModel) -> None:
+    aligned = prediction_error(trained, shift=0)
+    assert aligned < 0.8 * prediction_error(trained, shift=1)
+    assert aligned < 0.8 * prediction_error(trained, shift=-1)
+
+
+def test_recurrent_state_advances() -> None:
+    # TorchRL before December 2025 fed every step the initial state: constant inputs gave constant latents.
+    model = make_world_model()
+    images, actions = torch.full((1, 6, 3, 64, 64), 0.5), torch.full((1, 6, ACTION_DIM), 0.3)
+    latents = model.filter(images, actions).latent
+    assert (latents.diff(dim=1).abs().amax(-1) > 1e-6).all()
+
+
+def test_step_by_step_filtering_equals_sequence_filtering() -> None:
+    model = make_world_model()
+    images, actions = two_lamps(2, 9, seed=1)
+    whole = model.filter(images, actions).latent
+    state, prev_action = None, torch.zeros(2, 1, ACTION_DIM)
+    for t in range(9):
+        state = model.observe(images[:, t : t + 1], prev_action, state).last()
+        prev_action = actions[:, t : t + 1]
+        torch.testing.assert_close(state.latent, whole[:, t], atol=1e-5, rtol=1e-5)
+
+
+def test_batch_of_two_equals_each_alone() -> None:
+    model = make_world_model()
+    images, actions = two_lamps(2, 6, seed=2)
+    together = model.filter(images, actions).latent
+    for i in range(2):
+        alone = model.filter(images[i : i + 1], actions[i : i + 1]).latent
+        torch.testing.assert_close(alone[0], together[i], atol=1e-5, rtol=1e-5)
+
+
+def test_filter_is_causal() -> None:
+    model = make_world_model()
+    images, actions = two_lamps(1, 8, seed=3)
+    changed_images, changed_actions = images.clone(), actions.clone()
+    changed_images[:, 5:] = 0
+    changed_actions[:, 4:] = 0  # a_4 acts on o_5 onwards
+    before, after = model.filter(images, actions).latent, model.filter(changed_images, changed_actions).latent
+    torch.testing.assert_close(before[:, :5], after[:, :5], atol=1e-6, rtol=0)
+    assert not torch.allclose(before[:, 5:], after[:, 5:], atol=1e-4)
+
+
+def test_padded_steps_do_not_count() -> None:
+    model = make_world_model()
+    images, actions = two_lamps(2, 6, seed=4)
+    rewards, valid = torch.rand(2, 6), torch.ones(2, 6, dtype=torch.bool)
+    valid[:, 4:] = False
+    torch.manual_seed(0)
+    loss, _ = model.loss(images, actions, valid, rewards)
+    images[:, 4:], actions[:, 4:], rewards[:, 4:] = 0.7, 0.1, 5.0
+    torch.manual_seed(0)
+    changed, _ = model.loss(images, actions, valid, rewards)
+    torch.testing.assert_close(loss, changed)
+
+
+def test_reward_head_learns_the_reward_that_came_with_the_frame() -> None:
+    # r_{t-1} from s_t: the gradient of the loss with respect to the last reward of a window is zero.
+    model = make_world_model()
+    images, actions = two_lamps(1, 5, seed=5)
+    rewards = torch.rand(1, 5, requires_grad=True)
+    loss, _ = model.loss(images, actions, torch.ones(1, 5, dtype=torch.bool), rewards)
+    loss.backward()
+    assert (rewards.grad[:, :-1] != 0).all()
+    assert (rewards.grad[:, -1] == 0).all()
+
+
+def test_free_nats_clamp_each_step_before_the_mean() -> None:
+    config = RSSMConfig(free_nats=3.0, kl_scale=0.5)
+    kl = torch.tensor([[1.0, 5.0]])
+    loss, parts = world_model_loss(
+        {"image_loss": torch.zeros(1, 2)}, kl, torch.ones(1, 2, dtype=torch.bool), config
+    )
+    assert parts["kl_loss"].item() == pytest.approx(4.0)
+    assert parts["kl"].item() == pytest.approx(3.0)
+    assert parts["under_free_nats"].item() == pytest.approx(0.5)
+    assert loss.item() == pytest.approx(2.0)
+
+
+def test_kl_equals_torch_distributions() -> None:
+    generator = torch.Generator().manual_seed(0)
+    parameters = [torch.rand(4, 7, generator=generator) + 0.1 for _ in range(4)]
+    ours = DiagonalNormal(*parameters[:2]).kl(DiagonalNormal(*parameters[2:]))
+    normal = torch.distributions.Normal
+    theirs = torch.distributions.kl_divergence(normal(*parameters[:2]), normal(*parameters[2:])).sum(-1)
+    torch.testing.assert_close(ours, theirs)
+
+
+def test_paper_size() -> None:
+    model = WorldModel(RSSMConfig(image_channels=3, action_dim=4))
+    assert sum(p.numel() for p in model.parameters()) == pytest.approx(6.26e6, rel=1e-3)
+    assert model.config.latent_dim == 512
+
+
+def test_proprioceptive_variant_reconstructs_the_state() -> None:
+    model = make_world_model(use_proprio=True, proprio_dim=4)
+    images, actions = two_lamps(2, 4, seed=6)
+    proprio = torch.rand(2, 4, 4)
+    loss, parts = model.loss(
+        images, actions, torch.ones(2, 4, dtype=torch.bool), torch.zeros(2, 4), proprio=proprio
+    )
+    assert parts["proprio_loss"] > 0
+    loss.backward()
+    assert model.proprio_fusion.head.weight.grad.abs().sum() > 0
+
+
+def test_actions_are_scaled_by_the_models_own_statistics() -> None:
+    model, scaled = make_world_model(), make_world_model()
+    scaled.action_scaling.set_range(torch.tensor([-2.0, 0.0]), torch.tensor([2.0, 10.0]))
+    images, actions = two_lamps(1, 3, seed=7)
+    # a raw zero action precedes the first frame in both; choose units in which zero is zero
+    scaled.action_scaling.offset.zero_()
+    raw = scaled.action_scaling.inverse(actions)
+    torch.testing.assert_close(scaled.filter(images, raw).latent, model.filter(images, actions).latent)
