@@ -1,22 +1,32 @@
 #!/usr/bin/env bash
-# The whole path on one small machine: demonstrations, world model, latents, two policies, rollouts, report.
-# Safe to run again: a finished stage is skipped, an interrupted one starts afresh (collection goes on from its
-# finished episodes). After a change of settings, or to start from nothing, remove outputs/quickstart.
+# The whole path on one small machine: demonstrations, world model, latents, policies, rollouts, report.
+#
+#   scripts/quickstart.sh        the preset `quickstart`, about 10 minutes on two cores
+#   scripts/quickstart.sh cpu    the preset `cpu`: the paper's 780 demonstrations and 300 rollouts per policy, about 1.5 hours
+#
+# A preset's training settings are in configs/<preset>/. Safe to run again: a finished stage is skipped, an interrupted one
+# starts afresh (collection goes on from its finished episodes). To start from nothing, remove outputs/<preset>.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # Without bytecode files, which this variable forbids, each command spends 7 s more on its imports.
 unset PYTHONDONTWRITEBYTECODE
-bash scripts/setup.sh
 
+PRESET="${1:-quickstart}"
+case "$PRESET" in
+  # Rollouts: seeds 0-9 are the variations the demonstrations show, seeds from 10 on are unseen ones.
+  quickstart) EPISODES_PER_TASK=20 ROLLOUTS_PER_TASK=20 ARMS=(wm_bc wm_iql) ;;
+  cpu) EPISODES_PER_TASK=130 ROLLOUTS_PER_TASK=50 ARMS=(proprio_bc wm_bc wm_iql) ;;
+  *) echo "usage: scripts/quickstart.sh [quickstart|cpu]" >&2; exit 2 ;;
+esac
+
+bash scripts/setup.sh
 export HF_HUB_OFFLINE=1 MUJOCO_GL="${MUJOCO_GL:-egl}"
 PATH="$PWD/.venv/bin:$PATH"
 
-OUT=outputs/quickstart
-DATASET=(--dataset.repo_id=local/mt6_quickstart --dataset.root="$OUT/dataset")
-LATENTS=(--dataset.repo_id=local/mt6_quickstart_latents --dataset.root="$OUT/latents")
+OUT="outputs/$PRESET"
+DATASET=(--dataset.repo_id="local/mt6_$PRESET" --dataset.root="$OUT/dataset")
+LATENTS=(--dataset.repo_id="local/mt6_${PRESET}_latents" --dataset.root="$OUT/latents")
 WORLD_MODEL="$OUT/wm_rssm/checkpoints/last/pretrained_model"
-# Seeds 0-19 are variations 0-19: ten that the demonstrations show, ten that they do not.
-ROLLOUTS=(--env.type=metaworld_mt --env.task=mt6 --eval.n_episodes=20 --seed=0 --num_workers=2)
 
 # run_stage TITLE ARTEFACT COMMAND...: runs COMMAND unless the file it writes last is there already.
 run_stage() {
@@ -29,7 +39,14 @@ run_stage() {
   printf '\n== %s\n' "$title"
   "$@"
   [[ -e "$artefact" ]] || { echo "quickstart: '$title' ended without writing $artefact" >&2; exit 1; }
-  printf '== %s: %d s\n' "$title" $((SECONDS - start))
+  printf '== %s: %d s\n' "$title" $((SECONDS - start)) | tee -a "$OUT/times.txt"
+}
+
+# Written last in an arm's final checkpoint; an earlier checkpoint does not mean that the training is done.
+checkpoint() {
+  local steps
+  steps=$(grep -o '"steps": *[0-9]*' "configs/$PRESET/$1.json" | grep -o '[0-9]*')
+  printf '%s/checkpoints/%06d/training_state/optimizer_param_groups.json' "$OUT/$1" "$steps"
 }
 
 # LeRobot refuses to write into a folder that exists: what an interrupted stage left there goes first.
@@ -41,46 +58,58 @@ run_afresh() {
 }
 
 collect() {
-  lerobot-wm collect --tasks=mt6 --episodes_per_task=20 --variations=0-9 --noise=0.3 \
-    --repo_id=local/mt6_quickstart --root="$OUT/dataset" --num_workers=2
+  lerobot-wm collect --tasks=mt6 --episodes_per_task="$EPISODES_PER_TASK" --variations=0-9 --noise=0.3 --seed=0 \
+    --repo_id="local/mt6_$PRESET" --root="$OUT/dataset" --num_workers=2
 }
 
 train() {
-  local type="$1"
+  local arm="$1"
   shift
-  run_afresh "$OUT/$type" lerobot-wm train --policy.type="$type" --policy.push_to_hub=false \
-    --output_dir="$OUT/$type" --job_name="$type" --log_freq=50 "$@"
+  run_afresh "$OUT/$arm" lerobot-wm train --config_path="configs/$PRESET/$arm.json" --seed=0 \
+    --output_dir="$OUT/$arm" --job_name="$arm" "$@"
+}
+
+train_policy() {
+  local arm="$1" world_model=(--policy.world_model_path="$WORLD_MODEL")
+  [[ "$arm" == proprio_bc ]] && world_model=()
+  train "$arm" "${world_model[@]}" "${LATENTS[@]}"
 }
 
 encode() {
   lerobot-wm encode --world_model_path="$WORLD_MODEL" "${DATASET[@]}" \
-    --output_repo_id=local/mt6_quickstart_latents --output_root="$OUT/latents"
+    --output_repo_id="local/mt6_${PRESET}_latents" --output_root="$OUT/latents"
 }
 
 evaluate() {
-  local type="$1"
-  run_afresh "$OUT/eval_$type" lerobot-wm eval --policy.path="$OUT/$type/checkpoints/last/pretrained_model" \
-    --output_dir="$OUT/eval_$type" --arm="$type" --preset=quickstart "${ROLLOUTS[@]}"
+  local arm="$1"
+  # LeRobot draws a progress bar per environment step: what it says is kept beside the records.
+  run_afresh "$OUT/eval_$arm" lerobot-wm eval --policy.path="$OUT/$arm/checkpoints/last/pretrained_model" \
+    --env.type=metaworld_mt --env.task=mt6 --eval.n_episodes="$ROLLOUTS_PER_TASK" --seed=0 --num_workers=2 \
+    --output_dir="$OUT/eval_$arm" --arm="$arm" --preset="$PRESET" --videos_per_task=2 2>"$OUT/eval_$arm.log" \
+    || { tail -n 20 "$OUT/eval_$arm.log" >&2; return 1; }
 }
 
 report() {
-  cat "$OUT"/eval_{wm_bc,wm_iql}/records.jsonl >"$OUT/records.jsonl"
-  lerobot-wm report --records="$OUT/records.jsonl" --output_dir="$OUT/report" \
-    --videos="$OUT/eval_wm_bc,$OUT/eval_wm_iql" --train_logs="$OUT/wm_rssm,$OUT/wm_bc,$OUT/wm_iql" \
-    --world_model_path="$WORLD_MODEL" "${DATASET[@]}" --title="World-model quickstart, six Meta-World tasks"
+  local evaluations logs
+  evaluations=$(printf ",$OUT/eval_%s" "${ARMS[@]}")
+  logs=$(printf ",$OUT/%s" wm_rssm "${ARMS[@]}")
+  cat $(printf "$OUT/eval_%s/records.jsonl " "${ARMS[@]}") >"$OUT/records.jsonl"
+  lerobot-wm report --records="$OUT/records.jsonl" --output_dir="$OUT/report" --videos="${evaluations:1}" \
+    --train_logs="${logs:1}" --world_model_path="$WORLD_MODEL" "${DATASET[@]}" \
+    --title="World-model policies on six Meta-World tasks (preset $PRESET)"
 }
 
+mkdir -p "$OUT"
 lerobot-wm doctor
-run_stage "Collect 120 scripted demonstrations" "$OUT/dataset/meta/collection.json" collect
-run_stage "Pretrain one world model on all of them" "$OUT/wm_rssm/checkpoints/last" \
-  train wm_rssm "${DATASET[@]}" --steps=600 --batch_size=16
+run_stage "Collect $((6 * EPISODES_PER_TASK)) scripted demonstrations" "$OUT/dataset/meta/collection.json" collect
+run_stage "Pretrain one world model on all of them" "$(checkpoint wm_rssm)" train wm_rssm "${DATASET[@]}"
 run_stage "Encode the demonstrations into latents" "$OUT/latents/meta/latents.json" encode
-run_stage "Behaviour cloning on the latents" "$OUT/wm_bc/checkpoints/last" \
-  train wm_bc --policy.world_model_path="$WORLD_MODEL" "${LATENTS[@]}" --steps=3000 --batch_size=256
-run_stage "Implicit Q-learning on the latents" "$OUT/wm_iql/checkpoints/last" \
-  train wm_iql --policy.world_model_path="$WORLD_MODEL" "${LATENTS[@]}" --steps=3000 --batch_size=256
-run_stage "Roll out the BC policy" "$OUT/eval_wm_bc/eval_info.json" evaluate wm_bc
-run_stage "Roll out the IQL policy" "$OUT/eval_wm_iql/eval_info.json" evaluate wm_iql
+for arm in "${ARMS[@]}"; do
+  run_stage "Train $arm" "$(checkpoint "$arm")" train_policy "$arm"
+done
+for arm in "${ARMS[@]}"; do
+  run_stage "Roll out $arm" "$OUT/eval_$arm/eval_info.json" evaluate "$arm"
+done
 rm -rf "$OUT/report" # cheap, so it always shows the records that are there
 run_stage "Report" "$OUT/report/index.html" report
 
@@ -90,5 +119,5 @@ Finished in $((SECONDS / 60)) min $((SECONDS % 60)) s.
   page     $PWD/$OUT/report/index.html
   table    $PWD/$OUT/report/success.md
   records  $PWD/$OUT/records.jsonl
-  videos   $PWD/$OUT/eval_wm_bc/videos and $PWD/$OUT/eval_wm_iql/videos
+  videos   $PWD/$OUT/eval_*/videos
 END

@@ -44,7 +44,7 @@ class LatentRecord:
             )
         return cls(**json.loads(path.read_text()))
 
-    def check_world_model(self, fingerprint: str, path: str) -> None:
+    def check_world_model(self, fingerprint: str | None, path: str | None) -> None:
         """Refuse latents of another world model.
 
         Raises:

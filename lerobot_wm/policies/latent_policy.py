@@ -36,11 +36,14 @@ class LatentPolicy(StrictPolicy):
     ) -> None:
         super().__init__(config)
         world_model = None
-        if dataset_meta is not None and not config.tasks:  # made new, not loaded from a checkpoint
-            config.tasks = [str(task) for task in dataset_meta.tasks.index]
+        if dataset_meta is not None:  # to be trained
+            if not config.tasks:  # made new, not loaded from a checkpoint
+                config.tasks = [str(task) for task in dataset_meta.tasks.index]
+                if config.use_latent:
+                    world_model = _adopt_world_model(config)
+                config.input_features = _deployed_features(config)
             if config.use_latent:
-                world_model = _adopt_world_model(config, dataset_meta)
-            config.input_features = _deployed_features(config)
+                _check_latents(config, dataset_meta)
         config.validate_features()
         if config.use_latent:
             assert config.rssm is not None  # filled by _adopt_world_model or by the checkpoint
@@ -160,14 +163,20 @@ class LatentPolicy(StrictPolicy):
         return self._filter_state.latent
 
 
-def _adopt_world_model(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> WorldModel:
-    """Load the world model, check that the dataset's latents are its own, and note its sizes in `config`."""
+def _check_latents(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> None:
+    """Refuse a dataset without latents or with those of another world model."""
     if OBS_LATENT not in dataset_meta.features:
         raise ValueError(
             f"{dataset_meta.repo_id} has no '{OBS_LATENT}'. Encode it with the world model first (`lerobot-wm encode "
             f"--world_model_path=... --dataset.repo_id={dataset_meta.repo_id} ...`), or train with `lerobot-wm train`, "
             "which does so by itself."
         )
+    record = LatentRecord.read(Path(dataset_meta.root))
+    record.check_world_model(config.world_model_fingerprint, config.world_model_path)
+
+
+def _adopt_world_model(config: LatentPolicyConfig) -> WorldModel:
+    """Load the world model and note its sizes in `config`."""
     if config.world_model_path is None:
         raise ValueError(
             f"--policy.type={config.type} needs --policy.world_model_path=<folder or Hub id of a wm_rssm checkpoint>."
@@ -178,9 +187,6 @@ def _adopt_world_model(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetM
     config.image_key = world_model_policy.config.image_key
     config.input_features[config.image_key] = world_model_policy.config.input_features[config.image_key]
     config.world_model_fingerprint = weights_fingerprint(world_model)
-    LatentRecord.read(Path(dataset_meta.root)).check_world_model(
-        config.world_model_fingerprint, config.world_model_path
-    )
     return world_model
 
 

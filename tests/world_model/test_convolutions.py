@@ -1,6 +1,8 @@
+import pytest
 import torch
+from torch import nn
 
-from lerobot_wm.nn.conv import ConvDecoder, ConvEncoder
+from lerobot_wm.nn.conv import ConvDecoder, ConvEncoder, UpsamplingConv
 
 
 def test_decoder_equals_its_transposed_convolutions() -> None:
@@ -16,3 +18,19 @@ def test_shapes() -> None:
     assert ConvEncoder(6)(torch.zeros(2, 6, 64, 64)).shape == (2, 1024)
     assert ConvDecoder(16, 6)(torch.zeros(2, 16)).shape == (2, 6, 64, 64)
 
+
+
+@pytest.mark.parametrize("kernel_size", [5, 6])
+def test_upsampling_equals_the_transposed_convolution(kernel_size: int) -> None:
+    torch.manual_seed(0)
+    layer = UpsamplingConv(4, 3, kernel_size)
+    plain = nn.ConvTranspose2d(4, 3, kernel_size, stride=2)
+    plain.load_state_dict(layer.state_dict())
+    ours, theirs = (torch.randn(2, 4, 7, 7, generator=torch.Generator().manual_seed(1)) for _ in range(2))
+    ours.requires_grad_(), theirs.requires_grad_()
+    torch.testing.assert_close(layer(ours), plain(theirs))
+    weight = torch.randn_like(layer(ours))
+    (layer(ours) * weight).sum().backward()
+    (plain(theirs) * weight).sum().backward()
+    for mine, other in ((layer.weight, plain.weight), (layer.bias, plain.bias), (ours, theirs)):
+        torch.testing.assert_close(mine.grad, other.grad)
