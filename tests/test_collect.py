@@ -26,7 +26,7 @@ from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.envs.tasks import task_description, task_id
 from lerobot_wm.pipeline.collect import CollectConfig, collect, parse_variations
 from lerobot_wm.pipeline.collect_shards import Shard, ShardRecord, write_shard
-from lerobot_wm.pipeline.collect_workers import quiet
+from lerobot_wm.pipeline.quiet import quiet
 
 TASKS = ("reach-v3", "window-close-v3")
 EPISODES = 3

@@ -28,7 +28,8 @@ from lerobot_wm.pipeline.collect_shards import (
     ShardRecord,
     merge_shards,
 )
-from lerobot_wm.pipeline.collect_workers import quiet, write_missing_shards
+from lerobot_wm.pipeline.collect_workers import write_missing_shards
+from lerobot_wm.pipeline.quiet import quiet
 
 
 @dataclass

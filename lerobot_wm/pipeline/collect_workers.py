@@ -1,21 +1,16 @@
 """Writing shards, in this process or in several."""
 
-import logging
 import multiprocessing
 import os
 import threading
-import warnings
-from collections.abc import Iterator
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
-from contextlib import contextmanager
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
-import av.logging
-import datasets
 from tqdm import tqdm
 
 from lerobot_wm.pipeline.collect_shards import Shard, write_shard
+from lerobot_wm.pipeline.quiet import silence
 
 
 def write_missing_shards(shards: list[Shard], folder: Path, num_workers: int) -> None:
@@ -29,31 +24,6 @@ def write_missing_shards(shards: list[Shard], folder: Path, num_workers: int) ->
                 write_shard(shard, folder, on_episode=bar.update)
         else:
             _write_in_parallel(missing, folder, min(num_workers, len(missing)), bar)
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep what LeRobot, `datasets` and the codec print per episode off the screen, errors excepted."""
-    logger = logging.getLogger("lerobot")
-    level = logger.level
-    bars = datasets.utils.logging.is_progress_bar_enabled()
-    try:
-        with warnings.catch_warnings():
-            _silence()
-            yield
-    finally:
-        logger.setLevel(level)
-        av.logging.set_libav_level(av.logging.INFO)  # libav's default; it cannot be asked for
-        if bars:
-            datasets.enable_progress_bars()
-
-
-def _silence() -> None:
-    logging.getLogger("lerobot").setLevel(logging.ERROR)
-    av.logging.set_libav_level(av.logging.ERROR)
-    datasets.disable_progress_bars()
-    # Experts command more than +-1 by design; their actions are clipped before they are recorded.
-    warnings.filterwarnings("ignore", message="Constant.s. may be too high")
 
 
 def _write_in_parallel(shards: list[Shard], folder: Path, num_workers: int, bar: tqdm) -> None:
@@ -82,7 +52,7 @@ def _start_worker(finished: "SimpleQueue[None]") -> None:
     _finished = finished
     # A worker must not outlive a killed parent: it would write into the next run's folder.
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _silence()
+    silence()
 
 
 def _exit_with_parent() -> None:

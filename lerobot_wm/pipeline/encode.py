@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
+import numpy as np
 import torch
-from lerobot.configs.default import DatasetConfig
+from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.dataset_tools import modify_features
+from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot.utils.device_utils import auto_select_torch_device
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
@@ -22,6 +24,7 @@ from lerobot_wm.data.cache import cache_root, camera_frames
 from lerobot_wm.data.fingerprint import dataset_fingerprint, weights_fingerprint
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.data.tables import column_tensor
+from lerobot_wm.pipeline.quiet import quiet
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy, resize_images
 
 logger = logging.getLogger(__name__)
@@ -31,12 +34,21 @@ _FRAMES_PER_CHUNK = 512  # images per encoder call: bounds memory whatever the l
 
 
 @dataclass
+class SourceConfig:
+    """The image dataset: `--dataset.repo_id`, `--dataset.root`, `--dataset.revision` as in `lerobot-train`."""
+
+    repo_id: str
+    root: str | None = None
+    revision: str | None = None
+
+
+@dataclass
 class EncodeConfig:
     """Flags of `lerobot-wm encode`.
 
     Args:
         world_model_path: Folder or Hub id of a wm_rssm checkpoint.
-        dataset: The image dataset (`--dataset.repo_id`, `--dataset.root`, `--dataset.episodes`, ...).
+        dataset: The image dataset.
         output_repo_id: Repository id of the latent dataset.
         output_root: Its folder; must not exist yet.
         sample: Store a sample of z_t instead of its mean.
@@ -46,7 +58,7 @@ class EncodeConfig:
     """
 
     world_model_path: str
-    dataset: DatasetConfig
+    dataset: SourceConfig
     output_repo_id: str
     output_root: Path
     sample: bool = False
@@ -55,20 +67,10 @@ class EncodeConfig:
     push_to_hub: bool = False
 
 
-def latent_features(meta: LeRobotDatasetMetadata, latent_dim: int) -> dict[str, dict]:
-    """Schema of the latent dataset: the source's numeric features and `observation.latent` (D+S,)."""
-    kept = {
-        key: feature
-        for key, feature in meta.features.items()
-        if key not in meta.camera_keys and key not in DEFAULT_FEATURES
-    }
-    return {OBS_LATENT: {"dtype": "float32", "shape": (latent_dim,), "names": None}, **kept}
-
-
 @torch.no_grad()
 def filter_episodes(
     policy: WMRSSMPolicy, dataset: LeRobotDataset, *, sample: bool = False
-) -> Iterator[tuple[slice, Tensor]]:
+) -> Iterator[Tensor]:
     """Latents of every episode of `dataset`, a few episodes at a time.
 
     Args:
@@ -77,7 +79,7 @@ def filter_episodes(
         sample: Draw z_t instead of taking its mean.
 
     Yields:
-        For each episode in order: its rows in the dataset, and s_t for them, (T, D+S) float32 on the CPU.
+        For each episode in order, s_t for its frames: (T, D+S) float32 on the CPU.
     """
     policy.eval()
     world_model, device = policy.world_model, policy.world_model.action_scaling.offset.device
@@ -109,7 +111,7 @@ def filter_episodes(
         actions = pad_sequence([columns[ACTION][rows] for rows in batch], batch_first=True).to(device)
         states = world_model.filter_embeds(pad_sequence(embeds, batch_first=True), actions, sample=sample)
         for rows, latents in zip(batch, states.latent.cpu(), strict=True):
-            yield rows, latents[: rows.stop - rows.start]
+            yield latents[: rows.stop - rows.start]
 
 
 def _images(frames: Tensor, device: torch.device) -> Tensor:
@@ -129,13 +131,14 @@ def encode(
     *,
     sample: bool = False,
 ) -> LeRobotDataset:
-    """Write the latents of `source` as a LeRobotDataset that records which world model made them.
+    """Write a copy of `source` with `observation.latent` (D+S,) in place of its cameras.
 
-    The dataset is written beside `output_root` and moved there when whole: what lies there is complete.
+    The copy records which world model made it (`meta/latents.json`). It is written beside `output_root` and
+    moved there when whole: what lies there is complete.
 
     Args:
         policy: The frozen world model.
-        source: The image dataset.
+        source: The image dataset, all of its episodes.
         output_repo_id: Repository id of the result.
         output_root: Folder of the result.
         sample: Store a sample of z_t instead of its mean.
@@ -154,44 +157,29 @@ def encode(
             f"The world model watches '{policy.config.image_key}'; {source.repo_id} has the cameras "
             f"{source.meta.camera_keys}: use a dataset with that camera."
         )
+    episodes = filter_episodes(policy, source, sample=sample)
+    progress = tqdm(episodes, total=source.num_episodes, desc="Encoding", unit="episode")
+    latents = torch.cat(list(progress)).numpy()  # (N, D+S), in the dataset's order
+    if not np.isfinite(latents).all():
+        row = int(np.isfinite(latents).all(axis=1).argmin())
+        raise ValueError(
+            f"The world model's latents are not finite from frame {row} of {source.repo_id} on: "
+            "its weights or the actions there are broken."
+        )
     partial = output_root.with_name(f"{output_root.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    meta = source.meta
-    features = latent_features(meta, policy.config.rssm.latent_dim)
-    dataset = LeRobotDataset.create(
-        output_repo_id, meta.fps, features, root=partial, robot_type=meta.robot_type, use_videos=False
-    )
-    shapes = {key: tuple(features[key]["shape"]) for key in features if key != OBS_LATENT}
-    columns = {
-        key: column_tensor(source.hf_dataset, key, shape)
-        .reshape(-1, *shape)
-        .numpy()
-        .astype(features[key]["dtype"])
-        for key, shape in shapes.items()
-    }
-    task_index = column_tensor(source.hf_dataset, "task_index", (1,)).tolist()
-    for rows, latents in tqdm(
-        filter_episodes(policy, source, sample=sample),
-        total=source.num_episodes,
-        desc="Encoding",
-        unit="episode",
-    ):
-        if not torch.isfinite(latents).all():
-            raise ValueError(
-                f"The world model's latents are not finite at row {rows.start} of {source.repo_id}: "
-                "its weights or the episode's actions are broken."
-            )
-        for row, latent in zip(range(rows.start, rows.stop), latents.numpy(), strict=True):
-            frame = {key: column[row] for key, column in columns.items()}
-            task = str(meta.tasks.index[task_index[row]])
-            dataset.add_frame({OBS_LATENT: latent, **frame, "task": task})
-        dataset.save_episode()
-    dataset.finalize()
+    with quiet():
+        feature = {"dtype": "float32", "shape": latents.shape[1:], "names": None}
+        encoded = modify_features(
+            source, {OBS_LATENT: (latents, feature)}, source.meta.camera_keys, partial, output_repo_id
+        )
+    stats = get_feature_stats(latents, axis=0, keepdims=False)  # modify_features leaves new features out
+    write_stats({**encoded.meta.stats, OBS_LATENT: stats}, partial)
     LatentRecord(
         world_model_fingerprint=weights_fingerprint(policy.world_model),
         source_repo_id=source.repo_id,
         source_fingerprint=dataset_fingerprint(Path(source.root)),
-        tasks=[str(task) for task in meta.tasks.index],
+        tasks=[str(task) for task in source.meta.tasks.index],
         sampled=sample,
     ).write(partial)
     partial.replace(output_root)
@@ -230,12 +218,7 @@ def main() -> None:
     torch.manual_seed(cfg.seed)
     policy = WMRSSMPolicy.from_pretrained(cfg.world_model_path)
     policy.to(cfg.device or auto_select_torch_device())
-    source = LeRobotDataset(
-        cfg.dataset.repo_id,
-        root=cfg.dataset.root,
-        episodes=cfg.dataset.episodes,
-        revision=cfg.dataset.revision,
-    )
+    source = LeRobotDataset(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
     dataset = encode(policy, source, cfg.output_repo_id, cfg.output_root, sample=cfg.sample)
     logger.info("%d episodes, %d frames -> %s", dataset.num_episodes, dataset.num_frames, cfg.output_root)
     if cfg.push_to_hub:

@@ -19,7 +19,6 @@ def test_shapes() -> None:
     assert ConvDecoder(16, 6)(torch.zeros(2, 16)).shape == (2, 6, 64, 64)
 
 
-
 @pytest.mark.parametrize("kernel_size", [5, 6])
 def test_upsampling_equals_the_transposed_convolution(kernel_size: int) -> None:
     torch.manual_seed(0)

@@ -1,0 +1,35 @@
+"""Keeping other libraries' chatter off the screen while datasets are written."""
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import av.logging
+import datasets
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what LeRobot, `datasets` and the codec print per episode off the screen, errors excepted."""
+    logger = logging.getLogger("lerobot")
+    level = logger.level
+    bars = datasets.utils.logging.is_progress_bar_enabled()
+    try:
+        with warnings.catch_warnings():
+            silence()
+            yield
+    finally:
+        logger.setLevel(level)
+        av.logging.set_libav_level(av.logging.INFO)  # libav's default; it cannot be asked for
+        if bars:
+            datasets.enable_progress_bars()
+
+
+def silence() -> None:
+    """The same for a process of ours, for good."""
+    logging.getLogger("lerobot").setLevel(logging.ERROR)
+    av.logging.set_libav_level(av.logging.ERROR)
+    datasets.disable_progress_bars()
+    # Experts command more than +-1 by design; their actions are clipped before they are recorded.
+    warnings.filterwarnings("ignore", message="Constant.s. may be too high")
