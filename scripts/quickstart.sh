@@ -85,7 +85,8 @@ evaluate() {
   local arm="$1"
   # LeRobot draws a progress bar per environment step: what it says is kept beside the records.
   run_afresh "$OUT/eval_$arm" lerobot-wm eval --policy.path="$OUT/$arm/checkpoints/last/pretrained_model" \
-    --env.type=metaworld_mt --env.task=mt6 --env.episode_length="$EPISODE_LENGTH" --eval.n_episodes="$ROLLOUTS_PER_TASK" --seed="$FIRST_SEED" --num_workers=2 \
+    --env.type=metaworld_mt --env.task=mt6 --env.episode_length="$EPISODE_LENGTH" \
+    --eval.n_episodes="$ROLLOUTS_PER_TASK" --seed="$FIRST_SEED" --num_workers=2 \
     --output_dir="$OUT/eval_$arm" --arm="$arm" --preset="$PRESET" --videos_per_task=2 2>"$OUT/eval_$arm.log" \
     || { tail -n 20 "$OUT/eval_$arm.log" >&2; return 1; }
 }
