@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The whole path on one small machine: demonstrations, world model, latents, policies, rollouts, report.
 #
-#   scripts/quickstart.sh        the preset `quickstart`, about 10 minutes on two cores
+#   scripts/quickstart.sh        the preset `quickstart`, about 12 minutes on two cores
 #   scripts/quickstart.sh cpu    the preset `cpu`: the paper's 780 demonstrations and 300 rollouts per policy, about 1.5 hours
 #
 # A preset's training settings are in configs/<preset>/. Safe to run again: a finished stage is skipped, an interrupted one
