@@ -6,10 +6,14 @@ import sys
 # name -> (module with a main() that reads sys.argv, what it does)
 COMMANDS: dict[str, tuple[str, str]] = {
     "collect": ("lerobot_wm.pipeline.collect", "scripted-expert Meta-World demonstrations -> LeRobotDataset"),
+    "expert": ("lerobot_wm.pipeline.expert", "the scripted expert's rollouts, one record each"),
+    "relabel": ("lerobot_wm.pipeline.relabel", "copy of a dataset that is rewarded by another column"),
+    "init": ("lerobot_wm.pipeline.init", "checkpoint of an untrained world model or a frozen image backbone"),
     "train": ("lerobot_wm.pipeline.train", "lerobot-train with its flags, fed from RAM or GPU memory"),
     "encode": ("lerobot_wm.pipeline.encode", "image dataset + frozen world model -> latent LeRobotDataset"),
     "eval": ("lerobot_wm.pipeline.evaluate", "lerobot-eval with its flags, one record per rollout"),
     "report": ("lerobot_wm.report.build", "records -> success table and self-contained HTML page"),
+    "quality": ("lerobot_wm.report.quality", "how good a world model is on positions it was not trained on"),
     "doctor": ("lerobot_wm.pipeline.doctor", "check Python, GL, packages, GPU, disk and Hub login"),
 }
 

@@ -1,6 +1,6 @@
-"""Regenerate lerobot_wm/envs/variations.json: the 50 fixed variations of each Meta-World task.
+"""Regenerate lerobot_wm/envs/variations.json: the fixed variations of each Meta-World task, 50 in each set.
 
-    python scripts/make_variations.py        (half a minute)
+    python scripts/make_variations.py        (two minutes)
 
 Prints the file's SHA-256, which belongs in lerobot_wm/envs/variations.py.
 """
@@ -12,10 +12,9 @@ import pickle
 import metaworld
 from tqdm import tqdm
 
+from lerobot_wm.constants import VARIATION_SETS
 from lerobot_wm.envs.tasks import all_tasks
 from lerobot_wm.envs.variations import VARIATIONS_PATH
-
-SEED = 42
 
 
 def rand_vecs(task: str, seed: int) -> list[list[float]]:
@@ -24,10 +23,17 @@ def rand_vecs(task: str, seed: int) -> list[list[float]]:
     return [pickle.loads(train_task.data)["rand_vec"].tolist() for train_task in train_tasks]
 
 
+def set_text(seed: int) -> str:
+    """One set as JSON, a task per line so that a change is readable in a diff."""
+    lines = [
+        f'"{task}": {json.dumps(rand_vecs(task, seed))}' for task in tqdm(all_tasks(), desc=f"set {seed}")
+    ]
+    return f'"{seed}": {{\n' + ",\n".join(lines) + "\n}"
+
+
 def main() -> None:
-    """Write the file, one task per line so that a change is readable in a diff."""
-    lines = [f'"{task}": {json.dumps(rand_vecs(task, SEED))}' for task in tqdm(all_tasks())]
-    text = '{"sets": {"' + str(SEED) + '": {\n' + ",\n".join(lines) + "\n}}}\n"
+    """Write the file."""
+    text = '{"sets": {' + ",\n".join(set_text(seed) for seed in VARIATION_SETS) + "}}\n"
     VARIATIONS_PATH.write_text(text)
     print(f"{VARIATIONS_PATH.name}: SHA-256 {hashlib.sha256(text.encode()).hexdigest()}")
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from accelerate.state import AcceleratorState
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
@@ -30,6 +31,7 @@ def run_command(*arguments: str) -> None:
         cli.main()
     finally:
         sys.argv = before
+        AcceleratorState._reset_state(True)  # a process trains at one precision, but this one runs many commands
 
 
 @pytest.fixture(scope="session")

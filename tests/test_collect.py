@@ -24,7 +24,9 @@ from lerobot_wm.constants import (
 from lerobot_wm.data.schema import check_finite, metaworld_features
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.envs.tasks import task_description, task_id
-from lerobot_wm.pipeline.collect import CollectConfig, collect, parse_variations
+from lerobot_wm.envs.variations import parse_variations, rand_vec
+from lerobot_wm.pipeline.collect import CollectConfig, collect
+from lerobot_wm.pipeline.collect_report import COLLECTION_RECORD
 from lerobot_wm.pipeline.collect_shards import Shard, ShardRecord, write_shard
 from lerobot_wm.pipeline.quiet import quiet
 
@@ -163,6 +165,26 @@ def test_complete_dataset_is_left_alone(
     other = CollectConfig(**{**vars(config), "noise": 0.1})
     with pytest.raises(FileExistsError, match=r"noise 0.3 there, 0.1 here"):
         collect(other)
+    other = CollectConfig(**{**vars(config), "variation_set": 43})
+    with pytest.raises(FileExistsError, match=r"variation_set 42 there, 43 here"):
+        collect(other)
+
+
+def test_dataset_of_before_there_was_a_second_set_is_complete(
+    dataset: LeRobotDataset, config: CollectConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = json.loads((config.output_root / COLLECTION_RECORD).read_text())
+    del record["config"]["variation_set"]
+    (tmp_path / "meta").mkdir()
+    (tmp_path / COLLECTION_RECORD).write_text(json.dumps(record))
+    collect(CollectConfig(**{**vars(config), "root": tmp_path}))
+    assert "already complete" in capsys.readouterr().out
+
+
+def test_collection_on_the_second_set(tmp_path: Path) -> None:
+    one_shard(tmp_path, task="reach-v3", variation_set=43, variations=(7,))
+    shard = LeRobotDataset("shards/reach-v3-00000", root=tmp_path / "reach-v3-00000")
+    np.testing.assert_allclose(shard[0][OBS_ENV_STATE][36:], rand_vec("reach-v3", 7, 43)[3:], rtol=1e-6)
 
 
 def test_foreign_folder_is_never_overwritten(tmp_path: Path) -> None:
@@ -176,6 +198,7 @@ def one_shard(folder: Path, **changes: object) -> ShardRecord:
         "task": "door-open-v3",
         "first": 0,
         "count": 1,
+        "variation_set": 42,
         "variations": (9, 0),
         "noise": 0.3,
         "steps_after_success": 8,

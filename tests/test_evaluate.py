@@ -229,6 +229,11 @@ def test_variation_of_a_seed_is_the_environments(split: str, seed: int, expected
     env.close()
 
 
+def test_no_variation_of_the_second_set_is_seen() -> None:
+    config = MetaworldMTEnvConfig(task="reach-v3", variation_set=43)
+    assert variation_of(config, 3) == (3, False)
+
+
 def test_earlier_records_are_never_overwritten(policy_path: Path, tmp_path: Path) -> None:
     (tmp_path / "records.jsonl").write_text("")
     with pytest.raises(FileExistsError, match=r"records\.jsonl.*remove it"):

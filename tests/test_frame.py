@@ -28,7 +28,8 @@ LEVELS = {
     "policies": 4,
     "report": 5,
     "pipeline": 6,
-    "cli": 7,
+    "experiment": 7,
+    "cli": 8,
 }
 # Usable in any torch program: these know neither LeRobot nor a simulator.
 TORCH_ONLY = ("nn", "world_model", "rl")
@@ -83,7 +84,8 @@ def test_lerobot_discovers_types_and_imports_no_more_than_configurations(tmp_pat
         [sys.executable, "-c", DISCOVERY], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     lines = {line.split()[0]: set(line.split()[1:]) for line in run.stdout.splitlines()}
-    assert {"wm_rssm", "wm_bc", "wm_iql", "metaworld_mt"} <= lines["types"]
+    ours = {"wm_rssm", "frozen_backbone", "wm_bc", "wm_iql", "e2e_bc", "e2e_iql", "metaworld_mt"}
+    assert ours <= lines["types"]
     assert "lerobot_policy_wm" in lines["modules"]
     assert not {"mujoco", "metaworld"} & lines["modules"]
     assert not [name for name in lines["modules"] if name.startswith("lerobot_wm.") and ".modeling_" in name]
@@ -130,7 +132,12 @@ def test_wheel_holds_modules_data_and_license(tmp_path: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     tracked = {str(path.relative_to(ROOT)) for path in PACKAGE.rglob("*.py")}
     assert tracked <= names
-    data = {"lerobot_wm/envs/variations.json", "lerobot_wm/report/page.html.j2", "lerobot_policy_wm.py"}
+    data = {
+        "lerobot_wm/envs/variations.json",
+        "lerobot_wm/report/page.html.j2",
+        "lerobot_wm/report/quality_section.html.j2",
+        "lerobot_policy_wm.py",
+    }
     assert data <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests", "scripts", "outputs"))]

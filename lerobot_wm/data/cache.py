@@ -4,6 +4,7 @@ import logging
 import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -103,7 +104,10 @@ class CameraCache:
             return open_memmap(path, mode="r+")
         partial = path.with_suffix(f".{os.getpid()}.tmp")
         open_memmap(partial, mode="w+", dtype=np.uint8, shape=shape).flush()
-        partial.replace(path)
+        # A hard link, not a rename: where another process was faster its file stays, and both write into that one.
+        with suppress(FileExistsError):
+            os.link(partial, path)
+        partial.unlink()
         return open_memmap(path, mode="r+")
 
 

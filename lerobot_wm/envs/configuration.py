@@ -11,15 +11,17 @@ from typing import Any
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_wm.constants import (
     ACTION_DIM,
     CAMERA_NAME,
+    ENV_STATE_DIM,
     ENV_TYPE,
     FPS,
     IMAGE_SIZE,
     MAX_EPISODE_STEPS,
+    REPORTED_VARIATION_SET,
     STATE_DIM,
 )
 from lerobot_wm.envs.tasks import resolve_tasks
@@ -36,6 +38,8 @@ class MetaworldMTEnvConfig(EnvConfig):
     Args:
         task: a task, a set (mt6, mt10, mt50) or a comma-separated list.
         split: "all" (variations 0-49), "seen" (0-9) or "unseen" (10-49).
+        variation_set: 42, on which results are reported, or 43, other positions for choosing settings and for probes.
+        environment_state: add the full state, `observation.environment_state` (39,), to the observation.
         image_size: height and width of the image in pixels.
         camera_name: one of the model's cameras.
         fast_rendering: leave out shadows, reflections and multisampling.
@@ -46,6 +50,8 @@ class MetaworldMTEnvConfig(EnvConfig):
     task: str = "mt6"
     fps: int = FPS
     split: str = "all"
+    variation_set: int = REPORTED_VARIATION_SET
+    environment_state: bool = False
     image_size: int = IMAGE_SIZE
     camera_name: str = CAMERA_NAME
     fast_rendering: bool = True
@@ -64,7 +70,7 @@ class MetaworldMTEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         """Check every field and state the image's shape (height, width, channels)."""
         resolve_tasks(self.task)
-        split_variations(self.split)
+        split_variations(self.split, self.variation_set)
         if self.obs_type != "pixels_agent_pos":
             raise ValueError(f"obs_type is '{self.obs_type}'; this environment has only 'pixels_agent_pos'.")
         if self.image_size < 16:
@@ -77,12 +83,17 @@ class MetaworldMTEnvConfig(EnvConfig):
             raise ValueError(f"Unknown camera '{self.camera_name}'{hint}; expected {', '.join(CAMERAS)}.")
         shape = (self.image_size, self.image_size, 3)
         self.features["pixels"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+        if self.environment_state:
+            self.features["environment_state"] = PolicyFeature(type=FeatureType.ENV, shape=(ENV_STATE_DIM,))
+            self.features_map["environment_state"] = OBS_ENV_STATE
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of `MetaworldMTEnv` besides its task."""
         return {
             "split": self.split,
+            "variation_set": self.variation_set,
+            "environment_state": self.environment_state,
             "image_size": self.image_size,
             "camera_name": self.camera_name,
             "fast_rendering": self.fast_rendering,

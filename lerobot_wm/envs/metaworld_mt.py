@@ -8,9 +8,11 @@ import numpy as np
 from lerobot_wm.constants import (
     ACTION_DIM,
     CAMERA_NAME,
+    ENV_STATE_DIM,
     FPS,
     IMAGE_SIZE,
     MAX_EPISODE_STEPS,
+    REPORTED_VARIATION_SET,
     STATE_DIM,
 )
 from lerobot_wm.envs.rendering import Renderer, RenderKey
@@ -27,7 +29,8 @@ class MetaworldMTEnv(gym.Env):
     """One Meta-World v3 task; `reset(seed=k)` restores fixed variation k of its split, bit for bit.
 
     Observation: `pixels` uint8 (image_size, image_size, 3) RGB and `agent_pos` float32 (4,): the end
-    effector's position (m) and the gripper's opening (0 to 1). Action: float32 (4,) in [-1, 1], moving the
+    effector's position (m) and the gripper's opening (0 to 1); with `environment_state` also
+    `environment_state` float32 (39,), the property of that name. Action: float32 (4,) in [-1, 1], moving the
     end effector by up to 1 cm per axis, and the gripper's effort. Reward: 1 on a step that ends in success,
     else 0. `info` holds `is_success`, `variation` and, after a step, `dense_reward` (Meta-World's shaped
     reward, 0 to 10). The simulator is built at the first reset, so that many environments can be made cheaply.
@@ -35,6 +38,8 @@ class MetaworldMTEnv(gym.Env):
     Args:
         task: a Meta-World v3 task, such as "reach-v3".
         split: "all", "seen" (variations 0-9) or "unseen" (10-49).
+        variation_set: 42, on which results are reported, or 43, for choosing settings and for probes.
+        environment_state: add the full state to the observation, for policies that are given the truth.
         image_size: height and width of the image in pixels.
         camera_name: one of the model's cameras; "corner2" is moved to where every task is in view.
         fast_rendering: leave out shadows, reflections and multisampling.
@@ -48,6 +53,8 @@ class MetaworldMTEnv(gym.Env):
         self,
         task: str,
         split: str = "all",
+        variation_set: int = REPORTED_VARIATION_SET,
+        environment_state: bool = False,
         image_size: int = IMAGE_SIZE,
         camera_name: str = CAMERA_NAME,
         fast_rendering: bool = True,
@@ -56,14 +63,17 @@ class MetaworldMTEnv(gym.Env):
         self.task = task
         self.task_description = task_description(task)
         self._max_episode_steps = episode_length  # the name LeRobot's rollout reads
-        self._variations = split_variations(split)
+        self._variations = split_variations(split, variation_set)
+        self._variation_set = variation_set
+        self._environment_state = environment_state
         self._render_key = RenderKey(task, camera_name, image_size, fast_rendering)
-        self.observation_space = gym.spaces.Dict(
-            {
-                "pixels": gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
-                "agent_pos": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
-            }
-        )
+        spaces: dict[str, gym.Space] = {
+            "pixels": gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
+            "agent_pos": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
+        }
+        if environment_state:
+            spaces["environment_state"] = gym.spaces.Box(-np.inf, np.inf, (ENV_STATE_DIM,), np.float32)
+        self.observation_space = gym.spaces.Dict(spaces)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self._sim: Simulation | None = None
         self._renderer: Renderer | None = None
@@ -131,11 +141,17 @@ class MetaworldMTEnv(gym.Env):
     def _build(self) -> None:
         from lerobot_wm.envs.simulation import Simulation
 
-        self._sim = Simulation(self.task)
+        self._sim = Simulation(self.task, self._variation_set)
         self._renderer = Renderer.acquire(self._render_key, self._sim.model)
 
     def _observe(self) -> Observation:
         assert self._sim is not None
         assert self._renderer is not None
         self._image = self._renderer.render(self._sim.model, self._sim.data)
-        return {"pixels": self._image, "agent_pos": self._state[:STATE_DIM].astype(np.float32)}
+        observation: Observation = {
+            "pixels": self._image,
+            "agent_pos": self._state[:STATE_DIM].astype(np.float32),
+        }
+        if self._environment_state:
+            observation["environment_state"] = self._state.astype(np.float32)
+        return observation

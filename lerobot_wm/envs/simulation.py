@@ -8,7 +8,7 @@ import numpy as np
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.types import Task
 
-from lerobot_wm.constants import CAMERA_NAME, CAMERA_POSITION
+from lerobot_wm.constants import CAMERA_NAME, CAMERA_POSITION, REPORTED_VARIATION_SET
 from lerobot_wm.envs.variations import rand_vec
 
 SAVED_STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # everything mj_step reads
@@ -27,10 +27,15 @@ class Simulation:
 
     States are Meta-World's 39 numbers: hand (m), gripper opening and objects now (18) and one step ago (18),
     then the goal (3).
+
+    Args:
+        task: a Meta-World v3 task, such as "reach-v3".
+        variation_set: 42 or 43, see envs/variations.py.
     """
 
-    def __init__(self, task: str) -> None:
+    def __init__(self, task: str, variation_set: int = REPORTED_VARIATION_SET) -> None:
         self.task = task
+        self.variation_set = variation_set
         self._env: Any = ALL_V3_ENVIRONMENTS[task]()
         self.model: mujoco.MjModel = self._env.model
         self.data: mujoco.MjData = self._env.data
@@ -39,7 +44,7 @@ class Simulation:
     def reset(self, variation: int) -> np.ndarray:
         """Put hand, objects and goal where a variation has them, whatever ran before; returns the state."""
         data = {
-            "rand_vec": rand_vec(self.task, variation),
+            "rand_vec": rand_vec(self.task, variation, self.variation_set),
             "env_cls": type(self._env),
             "partially_observable": False,
         }

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import re
 import shutil
 import sys
 import time
@@ -13,8 +12,9 @@ from typing import Any
 import draccus
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from lerobot_wm.constants import IMAGE_SIZE, MAX_EPISODE_STEPS, NUM_VARIATIONS
+from lerobot_wm.constants import IMAGE_SIZE, MAX_EPISODE_STEPS, REPORTED_VARIATION_SET
 from lerobot_wm.envs.tasks import resolve_tasks
+from lerobot_wm.envs.variations import check_variation_set, parse_variations
 from lerobot_wm.pipeline.collect_report import (
     COLLECTION_RECORD,
     print_summary,
@@ -46,6 +46,8 @@ class CollectConfig:
     episodes_per_task: int = 130
     # Variations to collect on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
     variations: str = "0-9"
+    # Set of variations: 42, on which policies are trained and reported, or 43, for choosing settings and for probes.
+    variation_set: int = REPORTED_VARIATION_SET
     # Standard deviation of the Gaussian noise added to the expert's clipped actions.
     noise: float = 0.3
     # Steps kept after the first success, so that successful observations are in the data.
@@ -63,6 +65,7 @@ class CollectConfig:
         """Check every field."""
         resolve_tasks(self.tasks)
         parse_variations(self.variations)
+        check_variation_set(self.variation_set)
         limits = {
             "episodes_per_task": (1, None),
             "noise": (0, None),
@@ -88,6 +91,7 @@ class CollectConfig:
         return {
             "tasks": list(resolve_tasks(self.tasks)),
             "episodes_per_task": self.episodes_per_task,
+            "variation_set": self.variation_set,
             "variations": list(parse_variations(self.variations)),
             "noise": self.noise,
             "steps_after_success": self.steps_after_success,
@@ -97,24 +101,6 @@ class CollectConfig:
         }
 
 
-def parse_variations(spec: str) -> tuple[int, ...]:
-    """Turn "0-4,7" into (0, 1, 2, 3, 4, 7).
-
-    Raises:
-        ValueError: for anything but numbers and ranges of 0 to 49.
-    """
-    variations: dict[int, None] = {}  # an ordered set
-    for part in spec.split(","):
-        match = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
-        if match is None:
-            raise ValueError(f"variations is '{spec}'; expected numbers and ranges such as 0-9 or 0-4,7.")
-        first, last = match.group(1), match.group(2) or match.group(1)
-        variations.update(dict.fromkeys(range(int(first), int(last) + 1)))
-    if not variations or max(variations) >= NUM_VARIATIONS:
-        raise ValueError(f"variations is '{spec}'; expected numbers from 0 to {NUM_VARIATIONS - 1}.")
-    return tuple(variations)
-
-
 def plan_shards(config: CollectConfig) -> list[Shard]:
     """The shards of a collection in the order of the final dataset: by task, then by episode."""
     return [
@@ -122,6 +108,7 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
             task=task,
             first=first,
             count=min(SHARD_EPISODES, config.episodes_per_task - first),
+            variation_set=config.variation_set,
             variations=parse_variations(config.variations),
             noise=config.noise,
             steps_after_success=config.steps_after_success,
@@ -173,7 +160,8 @@ def _is_complete(config: CollectConfig, root: Path) -> bool:
         raise FileExistsError(
             f"{root} exists and was not made by `lerobot-wm collect`; give another --root or remove it."
         )
-    found = json.loads(record.read_text())["config"]
+    # Datasets made before there was a second set do not name theirs.
+    found = {"variation_set": REPORTED_VARIATION_SET, **json.loads(record.read_text())["config"]}
     _refuse_difference(
         found, config.identity(), f"{root} holds a dataset", "give another --root or remove it"
     )

@@ -35,6 +35,7 @@ class Shard:
     task: str
     first: int
     count: int
+    variation_set: int
     variations: tuple[int, ...]
     noise: float
     steps_after_success: int
@@ -104,7 +105,7 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
     start = time.monotonic()
     temporary = folder / f"{TEMPORARY_PREFIX}{os.getpid()}-{shard.name}"
     dataset = _create_dataset(temporary, shard)
-    simulation = Simulation(shard.task)
+    simulation = Simulation(shard.task, shard.variation_set)
     render_key = RenderKey(shard.task, CAMERA_NAME, shard.image_size, fast=True)
     renderer = Renderer.acquire(render_key, simulation.model)
     record = ShardRecord(episodes=[], failures={}, seconds=0.0)

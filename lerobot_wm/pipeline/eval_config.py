@@ -7,9 +7,8 @@ from lerobot.configs.default import EvalConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wm.constants import NUM_SEEN_VARIATIONS
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from lerobot_wm.envs.variations import split_variations
+from lerobot_wm.envs.variations import is_seen, split_variations
 
 
 @dataclass
@@ -89,6 +88,6 @@ def variation_of(env: EnvConfig, seed: int) -> tuple[int, bool | None]:
     """What a record says of `reset(seed=seed)`: (variation, seen); for other environments (seed, None)."""
     if not isinstance(env, MetaworldMTEnvConfig):
         return seed, None
-    variations = split_variations(env.split)
+    variations = split_variations(env.split, env.variation_set)
     variation = variations[seed % len(variations)]
-    return variation, variation < NUM_SEEN_VARIATIONS
+    return variation, is_seen(variation, env.variation_set)

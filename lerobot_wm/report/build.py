@@ -7,13 +7,14 @@ import draccus
 from lerobot.utils.import_utils import register_third_party_plugins
 from rich.console import Console
 
-from lerobot_wm.report.curves import curve_figures, read_curves
+from lerobot_wm.report.curves import curve_figures, read_logs
 from lerobot_wm.report.inline import PNG, SVG, data_uri, figure_bytes
 from lerobot_wm.report.open_loop import load_world_model, open_loop, strips_figure
-from lerobot_wm.report.page import Page
+from lerobot_wm.report.page import page_of_records
 from lerobot_wm.report.provenance import provenance
+from lerobot_wm.report.quality_page import quality_section
 from lerobot_wm.report.records import find_records, read_records
-from lerobot_wm.report.tables import markdown_table, runs, table_by_run, table_by_split, terminal_tables
+from lerobot_wm.report.tables import markdown_table, terminal_tables
 from lerobot_wm.report.videos import read_evaluation
 
 TERMINAL_WIDTH = 100
@@ -42,6 +43,8 @@ class ReportConfig:
     # Checkpoint of wm_rssm, wm_bc or wm_iql whose predictions on `--dataset.*` are shown.
     world_model_path: str | None = None
     dataset: ReportDatasetConfig = field(default_factory=ReportDatasetConfig)
+    # quality.json of `lerobot-wm quality`, whose section is included.
+    quality: Path | None = None
 
     def validate(self) -> None:
         """Refuse half of a pair of flags.
@@ -67,22 +70,14 @@ def report(cfg: ReportConfig) -> Path:
     """
     cfg.validate()
     records = read_records(find_records(cfg.records))
-    facts = provenance()
-    page = Page(
-        title=cfg.title,
-        table=table_by_run(records),
-        run_tables=[table_by_split(name, of_run) for name, of_run in runs(records).items()],
-        n_rollouts=len(records),
-        has_splits=any(record["seen"] is not None for record in records),
-        provenance={name: fact for name, fact in facts.items() if name != "command"},
-    )
-    for folder in _paths(cfg.videos):
-        evaluation = read_evaluation(folder)
-        page.clips += evaluation.clips
-        page.commands.append(evaluation.command)
-    page.commands.append(facts["command"])
-    logs = {run.name: read_curves(run) for run in _paths(cfg.train_logs)}
-    page.curves = [data_uri(figure_bytes(figure, SVG), SVG) for figure in curve_figures(logs)]
+    evaluations = [read_evaluation(folder) for folder in _paths(cfg.videos)]
+    clips = [clip for evaluation in evaluations for clip in evaluation.clips]
+    page = page_of_records(cfg.title, records, clips)
+    page.commands = [*(evaluation.command for evaluation in evaluations), provenance()["command"]]
+    curves = curve_figures(read_logs(_paths(cfg.train_logs)))
+    page.curves = [data_uri(figure_bytes(figure, SVG), SVG) for figure in curves]
+    if cfg.quality is not None:
+        page.quality = quality_section(cfg.quality)
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     if cfg.world_model_path is not None and cfg.dataset.repo_id is not None:
         page.dataset = cfg.dataset.repo_id
@@ -91,8 +86,12 @@ def report(cfg: ReportConfig) -> Path:
         (cfg.output_dir / "open_loop.png").write_bytes(picture)
         page.strips = data_uri(picture, PNG)
 
-    Console(width=TERMINAL_WIDTH).print(*terminal_tables(page.table))
-    (cfg.output_dir / "success.md").write_text(markdown_table(page.table))
+    tables = [*page.tables, page.paper_table, *page.comparison_tables]
+    shown = [table for table in tables if table is not None]
+    console = Console(width=TERMINAL_WIDTH)
+    for table in shown:
+        console.print(*terminal_tables(table))
+    (cfg.output_dir / "success.md").write_text("".join(map(markdown_table, [*shown, *page.detail_tables])))
     index = cfg.output_dir / "index.html"
     index.write_text(page.html())
     return index

@@ -1,8 +1,10 @@
 """Training curves from the `train_log.jsonl` of runs."""
 
 import json
+import os
 from pathlib import Path
 
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 LOG_NAME = "train_log.jsonl"
@@ -10,6 +12,20 @@ LOG_NAME = "train_log.jsonl"
 BOOKKEEPING = {"steps", "samples", "episodes", "epochs", "update_s", "dataloading_s", "samples_per_s"}
 # One run as {name: [(step, value), ...]}.
 Curves = dict[str, list[tuple[int, float]]]
+COLOURS = colormaps["tab20"].colors  # type: ignore[attr-defined]  # a ListedColormap
+LEGEND_COLUMNS = 2
+
+
+def read_logs(runs: list[Path]) -> dict[str, Curves]:
+    """The curves of runs, each named by its folder below the one that holds them all.
+
+    Raises:
+        FileNotFoundError: a folder holds no log.
+    """
+    if not runs:
+        return {}
+    common = os.path.commonpath([run.parent for run in runs])
+    return {os.path.relpath(run, common): read_curves(run) for run in runs}
 
 
 def read_curves(run: Path) -> Curves:
@@ -33,16 +49,31 @@ def read_curves(run: Path) -> Curves:
 
 
 def curve_figures(runs: dict[str, Curves]) -> list[Figure]:
-    """One figure per logged name, with one line per run that logged it."""
+    """One figure per logged name, with one line per run that logged it.
+
+    Runs whose folders have the same name (the seeds of an arm) share a colour and an entry in the legend.
+    """
     return [_figure(name, runs) for name in sorted({name for curves in runs.values() for name in curves})]
 
 
 def _figure(name: str, runs: dict[str, Curves]) -> Figure:
-    figure = Figure(figsize=(3.6, 2.4), layout="constrained")
-    axes = figure.subplots()
+    lines: dict[str, list[list[tuple[int, float]]]] = {}  # folder name -> its runs' points
     for run, curves in runs.items():
         if name in curves:
-            axes.plot(*zip(*curves[name], strict=True), linewidth=1.2, label=run)
+            lines.setdefault(Path(run).name, []).append(curves[name])
+    legend_rows = -(-len(lines) // LEGEND_COLUMNS) if len(runs) > 1 else 0
+    figure = Figure(figsize=(3.6, 2.4 + 0.15 * legend_rows), layout="constrained")
+    axes = figure.subplots()
+    for index, (label, of_label) in enumerate(lines.items()):
+        for number, points in enumerate(of_label):
+            axes.plot(
+                *zip(*points, strict=True),
+                color=COLOURS[
+                    (2 * index + index // 10) % 20
+                ],  # the ten strong ones, then their pale partners
+                linewidth=1.2,
+                label=None if number else label,
+            )
     lowest, highest = axes.dataLim.ymin, axes.dataLim.ymax
     if lowest > 0 and highest > 10 * lowest:  # a loss whose first steps would hide the rest
         axes.set_yscale("log")
@@ -51,5 +82,5 @@ def _figure(name: str, runs: dict[str, Curves]) -> Figure:
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.3)
     if len(runs) > 1:
-        axes.legend(fontsize=7)
+        figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS, fontsize=7, frameon=False)
     return figure

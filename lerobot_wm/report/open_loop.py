@@ -1,5 +1,6 @@
 """Open-loop prediction: the world model sees five frames, then imagines from actions alone."""
 
+import math
 from dataclasses import dataclass
 from textwrap import fill
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy, resize_images
+from lerobot_wm.world_model.model import WorldModel
 
 CONTEXT = 5  # frames the model sees
 HORIZONS = (1, 5, 10, 20, 45)  # frames ahead of the last one it saw
@@ -47,8 +49,7 @@ def load_world_model(path: str) -> WMRSSMPolicy | LatentPolicy:
     """
     config = PreTrainedConfig.from_pretrained(path)
     policy = get_policy_class(config.type).from_pretrained(path, config=config)
-    blind = isinstance(policy, LatentPolicy) and not policy.config.use_latent
-    if blind or not isinstance(policy, WMRSSMPolicy | LatentPolicy):
+    if not isinstance(policy, WMRSSMPolicy | LatentPolicy) or policy.config.rssm is None:
         raise ValueError(
             f"{path} ({config.type}) holds no world model: give a wm_rssm, wm_bc or wm_iql checkpoint."
         )
@@ -92,6 +93,7 @@ def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[s
         return torch.stack([window[key] for window in windows]).to(policy.config.device)
 
     world_model, image_key = policy.world_model, policy.config.image_key
+    assert isinstance(world_model, WorldModel)  # as load_world_model checked
     assert image_key is not None  # whoever holds a world model has a camera
     images = resize_images(batch(image_key))  # (B, T, C, 64, 64)
     actions = batch(ACTION)  # (B, T, A)
@@ -109,6 +111,11 @@ def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[s
         psnr=_psnr(imagined, future),
         copy_psnr=_psnr(last_seen, future),
     )
+
+
+def psnr(squared_error: float) -> float:
+    """PSNR in dB of a mean squared error of images in [0, 1]; images that are equal are given 100 dB."""
+    return -10 * math.log10(max(squared_error, 1e-10))
 
 
 def strips_figure(results: list[OpenLoop]) -> Figure:
@@ -134,7 +141,7 @@ def strips_figure(results: list[OpenLoop]) -> Figure:
 def _psnr(predicted: Tensor, truth: Tensor) -> list[float]:
     """PSNR in dB at each horizon, images (B, T, C, H, W) in [0, 1]."""
     error = (predicted - truth).square().mean(dim=(0, 2, 3, 4))[[horizon - 1 for horizon in HORIZONS]]
-    return (-10 * error.log10()).tolist()
+    return [psnr(value) for value in error.tolist()]
 
 
 def _pixels(image: np.ndarray) -> np.ndarray:

@@ -5,9 +5,24 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from lerobot_wm.report.arms import ARMS, by_arm
+from lerobot_wm.report.bootstrap import Estimate
+from lerobot_wm.report.inline import SVG, data_uri, figure_bytes
 from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, OpenLoop
-from lerobot_wm.report.tables import SuccessTable
-from lerobot_wm.report.videos import Clip
+from lerobot_wm.report.outcomes import OutcomeGrid, outcome_grids
+from lerobot_wm.report.provenance import provenance
+from lerobot_wm.report.records import Record
+from lerobot_wm.report.split_figure import split_figure
+from lerobot_wm.report.statistics import SuccessRate, in_split
+from lerobot_wm.report.success import (
+    comparison_tables,
+    overall_table,
+    paper_comparison,
+    seed_table,
+    task_table,
+)
+from lerobot_wm.report.tables import ReportTable, cell_text, present_splits
+from lerobot_wm.report.videos import MAX_VIDEO_BYTES, Clip, within_limit
 
 
 @dataclass
@@ -15,20 +30,26 @@ class Page:
     """The content of a report; a section without content is left out."""
 
     title: str
-    table: SuccessTable
-    run_tables: list[SuccessTable]
+    arms: list[tuple[str, str, str]]  # arm, preset, what it is
     n_rollouts: int
-    has_splits: bool  # whether records tell seen from unseen variations
+    tables: list[ReportTable]
+    detail_tables: list[ReportTable]
+    paper_table: ReportTable | None
+    comparison_tables: list[ReportTable]
+    grids: list[OutcomeGrid]
     provenance: dict[str, str]
+    split_picture: str = ""  # data URI
+    n_clips: tuple[int, int] = (0, 0)  # videos on the page, videos there were
+    video_megabytes: int = 0  # the limit on all videos together
     commands: list[str] = field(default_factory=list)
-    clips: list[Clip] = field(default_factory=list)
     open_loop: list[OpenLoop] = field(default_factory=list)
     strips: str = ""  # data URI of the strips' picture
     dataset: str = ""  # repo id of the dataset the strips are of
+    quality: str = ""  # HTML of the world model's quality
     curves: list[str] = field(default_factory=list)  # data URIs, one per logged quantity
 
     def html(self) -> str:
-        """One self-contained page: no scripts, and nothing is fetched when it is opened."""
+        """One self-contained page: nothing is fetched when it is opened; its few lines of script play videos."""
         environment = Environment(
             loader=FileSystemLoader(Path(__file__).parent),
             autoescape=True,
@@ -36,4 +57,39 @@ class Page:
             trim_blocks=True,
             lstrip_blocks=True,
         )
+        environment.tests["rate"] = lambda cell: isinstance(cell, SuccessRate | Estimate)
+        environment.tests["counted"] = lambda cell: isinstance(cell, SuccessRate)
+        environment.filters["text"] = cell_text
         return environment.get_template("page.html.j2").render(vars(self), context=CONTEXT, horizons=HORIZONS)
+
+
+def page_of_records(title: str, records: list[Record], clips: list[Clip]) -> Page:
+    """What the page shows of the records and of the videos of their rollouts."""
+    inlined = within_limit(clips)
+    page = Page(
+        title=title,
+        arms=[(arm, runs[0]["preset"], ARMS.get(arm, "")) for arm, runs in by_arm(records).items()],
+        n_rollouts=len(records),
+        tables=[task_table("Success per task", records), overall_table(records)],
+        detail_tables=_detail_tables(records),
+        paper_table=paper_comparison(records),
+        comparison_tables=comparison_tables(records),
+        grids=outcome_grids(records, inlined),
+        n_clips=(len(inlined), len(clips)),
+        video_megabytes=MAX_VIDEO_BYTES // 1_000_000,
+        provenance={name: fact for name, fact in provenance().items() if name != "command"},
+    )
+    if len(present_splits(records)) > 1:
+        page.split_picture = data_uri(figure_bytes(split_figure(records), SVG), SVG)
+    return page
+
+
+def _detail_tables(records: list[Record]) -> list[ReportTable]:
+    """Per task: seen and unseen variations apart, and each training seed where an arm has several."""
+    tables = [
+        task_table(f"Success per task, {split} variations", [r for r in records if in_split(r, split)])
+        for split in present_splits(records)
+        if split != "all"
+    ]
+    runs = {(record["arm"], record["seed"]) for record in records}
+    return [*tables, seed_table(records)] if len(runs) > len(by_arm(records)) else tables

@@ -49,10 +49,12 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
     """All records of the files, in order.
 
     Raises:
-        ValueError: when a line is not a record, when a rollout occurs twice, or when there is none at all.
+        ValueError: when a line is not a record, when a rollout occurs twice, when one arm has two presets, or when
+            there is no record at all.
     """
     records: list[Record] = []
     origins: dict[tuple, str] = {}
+    presets: dict[str, str] = {}
     for path in paths:
         for number, line in enumerate(path.read_text().splitlines(), start=1):
             record = _parse(line, where=f"{path}:{number}")
@@ -63,10 +65,24 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
                     f"{origins[rollout]}. Give each run once, and different runs different --arm names."
                 )
             origins[rollout] = f"{path}:{number}"
+            preset = presets.setdefault(record["arm"], record["preset"])
+            if preset != record["preset"]:
+                raise ValueError(
+                    f"{path}:{number}: arm '{record['arm']}' has preset '{record['preset']}' here, '{preset}' before. "
+                    "The seeds of an arm are pooled: report the presets apart, or evaluate under another --arm."
+                )
             records.append(record)
     if not records:
         raise ValueError("The records files are empty: run `lerobot-wm eval` first.")
     return records
+
+
+def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Records by task, tasks in alphabetical order."""
+    found: dict[str, list[Record]] = {}
+    for record in records:
+        found.setdefault(record["task"], []).append(record)
+    return dict(sorted(found.items()))
 
 
 def _parse(line: str, where: str) -> Record:

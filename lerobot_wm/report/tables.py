@@ -1,95 +1,89 @@
-"""Success tables: one data structure for the terminal, for markdown and for the page's template."""
+"""The report's tables: one data structure for the terminal, for markdown and for the page's template."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import batched
 
+from rich.console import RenderableType
 from rich.table import Table
+from rich.text import Text
 
-from lerobot_wm.report.records import Record
+from lerobot_wm.report.bootstrap import Estimate
+from lerobot_wm.report.records import Record, by_task
 from lerobot_wm.report.statistics import SPLITS, SuccessRate, in_split, success_rate
 
-# Three cells of "50/50  100 [93, 100]" beside the longest task name fit a terminal of 100 columns.
-COLUMNS_PER_TERMINAL_TABLE = 3
+# What a terminal of 100 columns holds beside the longest label.
+FULL_COLUMNS, COMPACT_COLUMNS = 3, 6
+WILSON = "Successes/rollouts, per cent, [Wilson 95% interval over rollouts]."
+
+Cell = SuccessRate | Estimate | str | int | None
 
 
 @dataclass(frozen=True)
-class SuccessTable:
-    """Success rates by row and column; a cell is None where nothing was rolled out."""
+class ReportTable:
+    """Labelled rows of cells; a cell is None where there is nothing to show."""
 
     title: str
+    corner: str  # what the row labels are
     columns: list[str]
-    rows: dict[str, list[SuccessRate | None]]
-    n_totals: int  # how many of the last rows are over all tasks
+    rows: list[tuple[str, list[Cell]]]
+    n_totals: int = 0  # how many of the last rows are over all tasks
+    notes: list[str] = field(default_factory=list)
 
 
-def runs(records: list[Record]) -> dict[str, list[Record]]:
-    """Records by run (arm and training seed); the seed is named only where an arm has several."""
-    seeds: dict[str, set[int | None]] = {}
-    for record in records:
-        seeds.setdefault(record["arm"], set()).add(record["seed"])
-    by_run: dict[str, list[Record]] = {}
-    for record in records:
-        several = len(seeds[record["arm"]]) > 1
-        name = f"{record['arm']} seed {record['seed']}" if several else record["arm"]
-        by_run.setdefault(name, []).append(record)
-    return by_run
+def table_by_split(title: str, records: list[Record]) -> ReportTable:
+    """One arm's records: tasks down; seen, unseen and all variations across."""
 
-
-def table_by_run(records: list[Record]) -> SuccessTable:
-    """Tasks down, runs across; below them all tasks together: seen, unseen and all variations."""
-    by_run = runs(records)
-    rows = {task: [success_rate(_of_task(run, task)) for run in by_run.values()] for task in _tasks(records)}
-    for split in _splits(records):
-        name = "all tasks" if split == "all" else f"all tasks, {split}"
-        rows[name] = [success_rate(r for r in run if in_split(r, split)) for run in by_run.values()]
-    return SuccessTable("Success per task", list(by_run), rows, len(_splits(records)))
-
-
-def table_by_split(title: str, records: list[Record]) -> SuccessTable:
-    """One run's records: tasks down; seen, unseen and all variations across."""
-
-    def cells(chosen: list[Record]) -> list[SuccessRate | None]:
+    def cells(chosen: list[Record]) -> list[Cell]:
         return [success_rate(r for r in chosen if in_split(r, split)) for split in splits]
 
-    splits = _splits(records)
-    rows = {task: cells(_of_task(records, task)) for task in _tasks(records)}
-    return SuccessTable(title, list(splits), rows | {"all tasks": cells(records)}, n_totals=1)
+    splits = present_splits(records)
+    rows = [(task, cells(of_task)) for task, of_task in by_task(records).items()]
+    rows.append(("all tasks", cells(records)))
+    return ReportTable(title, "task", list(splits), rows, n_totals=1, notes=[WILSON])
 
 
-def terminal_tables(table: SuccessTable) -> list[Table]:
-    """The table for rich's console, cut into groups of columns that fit 100 characters."""
-    tables = []
-    for start in range(0, len(table.columns), COLUMNS_PER_TERMINAL_TABLE):
-        chosen = slice(start, start + COLUMNS_PER_TERMINAL_TABLE)
-        shown = Table(title=table.title, caption="successes/rollouts  % [Wilson 95%]")
-        shown.add_column("task")
-        for column in table.columns[chosen]:
-            shown.add_column(column, justify="right")
-        for index, (name, cells) in enumerate(table.rows.items(), start=1):
-            last_of_section = index == len(table.rows) - table.n_totals
-            shown.add_row(name, *_texts(cells[chosen]), end_section=last_of_section)
-        tables.append(shown)
-    return tables
-
-
-def markdown_table(table: SuccessTable) -> str:
-    """The table as GitHub markdown."""
-    lines = ["| task | " + " | ".join(table.columns) + " |", "|---|" + "---:|" * len(table.columns)]
-    lines += [f"| {name} | " + " | ".join(_texts(cells)) + " |" for name, cells in table.rows.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _texts(cells: list[SuccessRate | None]) -> list[str]:
-    return ["–" if cell is None else str(cell) for cell in cells]
-
-
-def _tasks(records: list[Record]) -> list[str]:
-    return sorted({record["task"] for record in records})
-
-
-def _of_task(records: list[Record], task: str) -> list[Record]:
-    return [record for record in records if record["task"] == task]
-
-
-def _splits(records: list[Record]) -> tuple[str, ...]:
+def present_splits(records: Iterable[Record]) -> tuple[str, ...]:
     """The splits that have records: "seen" and "unseen" only where the environment knows them."""
-    return tuple(split for split in SPLITS if any(in_split(record, split) for record in records))
+    known = {record["seen"] for record in records}
+    return tuple(s for s in SPLITS if s == "all" or (s == "seen") in known)
+
+
+def terminal_tables(table: ReportTable) -> list[RenderableType]:
+    """The table for rich's console in at most 100 characters, then its notes.
+
+    With more than three columns rates lose their counts ("88 76–94"); with more than six the table is cut.
+    """
+    compact = len(table.columns) > FULL_COLUMNS
+    shown: list[RenderableType] = []
+    for chosen in batched(range(len(table.columns)), COMPACT_COLUMNS):
+        part = Table(title=table.title, title_justify="left", box=None, padding=(0, 1), pad_edge=False)
+        part.add_column(table.corner, no_wrap=True)
+        for index in chosen:
+            part.add_column(table.columns[index].removesuffix("-v3").replace("-", "\n"), justify="right")
+        for number, (label, cells) in enumerate(table.rows, start=1):
+            texts = [_compact(cells[index]) if compact else cell_text(cells[index]) for index in chosen]
+            part.add_row(label, *texts, end_section=number == len(table.rows) - table.n_totals)
+        shown.append(part)
+    shown.append(Text("\n".join([*table.notes, ""]), style="dim"))
+    return shown
+
+
+def markdown_table(table: ReportTable) -> str:
+    """The table as GitHub markdown under a heading, its notes below."""
+    lines = [f"## {table.title}", "", f"| {table.corner} | {' | '.join(table.columns)} |"]
+    lines.append("|---|" + "---:|" * len(table.columns))
+    lines += [f"| {label} | {' | '.join(map(cell_text, cells))} |" for label, cells in table.rows]
+    return "\n".join(lines) + "\n\n" + "".join(f"{note}\n\n" for note in table.notes)
+
+
+def cell_text(cell: Cell) -> str:
+    """A cell in full."""
+    return "–" if cell is None else str(cell)
+
+
+def _compact(cell: Cell) -> str:
+    if isinstance(cell, SuccessRate | Estimate):
+        low, high = cell.interval
+        return f"{cell.percent:.0f} [dim]{low:.0f}–{high:.0f}[/dim]"
+    return cell_text(cell)

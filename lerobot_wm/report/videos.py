@@ -1,28 +1,31 @@
 """Rollout videos of `lerobot-wm eval` for the page."""
 
 import json
-import logging
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_wm.report.inline import MP4, data_uri
 
-logger = logging.getLogger(__name__)
-
-# Larger files would make the page unwieldy; 500 steps at 256x256 take 150 kB.
-MAX_INLINE_BYTES = 4_000_000
+# All videos of a page together; as data URIs they take a third more. 500 steps at 256x256 take 150 kB.
+MAX_VIDEO_BYTES = 12_000_000
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One rollout's video; `outcome` is "success" or "failure", `src` a data URI."""
+    """One rollout's video."""
 
     arm: str
     task: str
     variation: int
-    outcome: str
-    src: str
+    success: bool
+    path: Path
+
+    @property
+    def src(self) -> str:
+        """The video as a data URI."""
+        return data_uri(self.path.read_bytes(), MP4)
 
 
 @dataclass(frozen=True)
@@ -34,10 +37,11 @@ class Evaluation:
 
 
 def read_evaluation(folder: Path) -> Evaluation:
-    """Read an evaluation's output folder; videos too large to inline are left out with a warning.
+    """Read an evaluation's output folder.
 
     Raises:
         FileNotFoundError: the folder is not the output of `lerobot-wm eval`.
+        ValueError: a video has a name that `lerobot-wm eval` does not give.
     """
     path = folder / "eval_info.json"
     if not path.exists():
@@ -50,9 +54,22 @@ def read_evaluation(folder: Path) -> Evaluation:
             raise ValueError(
                 f"{video} is not named as `lerobot-wm eval` names videos: remove it from {folder}."
             )
-        if video.stat().st_size > MAX_INLINE_BYTES:
-            logger.warning("%s is larger than %d bytes: not on the page.", video, MAX_INLINE_BYTES)
-            continue
-        src = data_uri(video.read_bytes(), MP4)
-        clips.append(Clip(info["arm"], video.parent.name, int(name[1]), name[2], src))
+        clips.append(Clip(info["arm"], video.parent.name, int(name[1]), name[2] == "success", video))
     return Evaluation(info["provenance"]["command"], clips)
+
+
+def within_limit(clips: list[Clip]) -> list[Clip]:
+    """The videos that `MAX_VIDEO_BYTES` leaves room for: failures first, and of each arm and task in turn."""
+    taken: Counter[tuple[str, str, bool]] = Counter()
+    turns = []
+    for clip in clips:
+        group = (clip.arm, clip.task, clip.success)
+        turns.append((clip.success, taken[group]))
+        taken[group] += 1
+    chosen, room = [], MAX_VIDEO_BYTES
+    for _, clip in sorted(zip(turns, clips, strict=True), key=lambda pair: pair[0]):
+        size = clip.path.stat().st_size
+        if size <= room:
+            chosen.append(clip)
+            room -= size
+    return chosen

@@ -5,8 +5,9 @@ from lerobot.configs import FeatureType
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features, preprocess_observation
 
-from lerobot_wm.constants import ACTION, MT6, OBS_IMAGE, OBS_STATE
+from lerobot_wm.constants import ACTION, MT6, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
+from lerobot_wm.envs.variations import rand_vec
 
 
 def test_policy_features() -> None:
@@ -16,6 +17,18 @@ def test_policy_features() -> None:
         OBS_STATE: (FeatureType.STATE, (4,)),
         ACTION: (FeatureType.ACTION, (4,)),
     }
+
+
+def test_environment_state_reaches_policies_under_lerobots_name() -> None:
+    config = MetaworldMTEnvConfig(task="reach-v3", variation_set=43, environment_state=True)
+    feature = env_to_policy_features(config)[OBS_ENV_STATE]
+    assert (feature.type, feature.shape) == (FeatureType.ENV, (39,))
+    vector_env = make_env(config, n_envs=2)["reach-v3"][0]
+    observation, _ = vector_env.reset(seed=[4, 5])
+    states = preprocess_observation(observation)[OBS_ENV_STATE]
+    goals = [rand_vec("reach-v3", k, 43)[3:] for k in (4, 5)]
+    np.testing.assert_allclose(states[:, 36:], goals, rtol=1e-6)
+    vector_env.close()
 
 
 def test_one_group_per_task_built_lazily() -> None:

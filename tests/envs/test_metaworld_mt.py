@@ -73,6 +73,25 @@ def test_seed_picks_the_variation_of_the_split(make_env: MakeEnv) -> None:
         assert following == env.reset(seed=seeds[-1] + 1)[1]["variation"]
 
 
+def test_the_second_set_holds_other_positions(make_env: MakeEnv, actions: np.ndarray) -> None:
+    first, second = make_env("window-close-v3"), make_env("window-close-v3", variation_set=43)
+    handles = [episode(env, 3, actions)[0][0, 4:7] for env in (first, second)]
+    assert np.abs(handles[0] - handles[1]).max() > 0.01  # metres
+    np.testing.assert_array_equal(episode(second, 3, actions)[0], episode(second, 53, actions)[0])
+
+
+def test_environment_state_is_observed_on_demand(make_env: MakeEnv, actions: np.ndarray) -> None:
+    env = make_env("window-close-v3", environment_state=True)
+    observation, _ = env.reset(seed=0)
+    for action in actions:
+        assert env.observation_space.contains(observation)
+        np.testing.assert_array_equal(
+            observation["environment_state"], env.environment_state.astype(np.float32)
+        )
+        observation, *_ = env.step(action)
+    assert "environment_state" not in make_env("window-close-v3").reset(seed=0)[0]
+
+
 def test_expert_succeeds_and_ends_the_episode(make_env: MakeEnv) -> None:
     from metaworld.policies import SawyerButtonPressTopdownV3Policy
 

@@ -1,3 +1,4 @@
+import hashlib
 import json
 import subprocess
 import sys
@@ -6,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_wm.constants import MT6, MT10
+from lerobot_wm.constants import MT6, MT10, VARIATION_SETS
 from lerobot_wm.envs import variations
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.tasks import all_tasks, expert_name, resolve_tasks, task_description, task_id
@@ -42,22 +43,38 @@ def test_names_equal_lerobots() -> None:
     assert sorted(shared) == ["push-back-v3", "push-v3"]
 
 
-def test_variations_are_metaworlds_own() -> None:
+@pytest.mark.parametrize("variation_set", VARIATION_SETS)
+def test_variations_are_metaworlds_own(variation_set: int) -> None:
     import pickle
 
     import metaworld
 
-    tasks = metaworld.MT1("window-close-v3", seed=42).train_tasks
+    tasks = metaworld.MT1("window-close-v3", seed=variation_set).train_tasks
     for k, task in enumerate(tasks):
-        ours = variations.rand_vec("window-close-v3", k)
+        ours = variations.rand_vec("window-close-v3", k, variation_set)
         np.testing.assert_array_equal(ours, pickle.loads(task.data)["rand_vec"])
 
 
 def test_variations_are_complete_and_distinct() -> None:
-    data = json.loads(variations.VARIATIONS_PATH.read_bytes())["sets"]["42"]
-    assert set(data) == set(all_tasks())
-    for vectors in data.values():
-        assert len({tuple(vector) for vector in vectors}) == 50
+    """Within a set and between the sets: what settings are chosen on is not what is reported."""
+    sets = json.loads(variations.VARIATIONS_PATH.read_bytes())["sets"]
+    assert set(sets) == {"42", "43"}
+    for task in all_tasks():
+        assert len({tuple(vector) for data in sets.values() for vector in data[task]}) == 100
+    assert sets["42"].keys() == sets["43"].keys() == set(all_tasks())
+
+
+def test_reported_variations_never_change() -> None:
+    vectors = json.loads(variations.VARIATIONS_PATH.read_bytes())["sets"]["42"]
+    digest = hashlib.sha256(json.dumps(vectors).encode()).hexdigest()
+    assert digest == "2ac92332ce71a4023cbdeb190a21c37706cc343428dd2bd0c16ad586249fdb2c"
+
+
+def test_seen_are_the_variations_collected_on() -> None:
+    assert [variations.is_seen(k) for k in (0, 9, 10, 49)] == [True, True, False, False]
+    assert not any(variations.is_seen(k, 43) for k in range(50))
+    with pytest.raises(ValueError, match="43 has no seen variations"):
+        variations.split_variations("seen", 43)
 
 
 def test_changed_variations_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,6 +92,7 @@ def test_changed_variations_are_refused(tmp_path: Path, monkeypatch: pytest.Monk
     [
         ("task", "reach", "reach-v3"),
         ("split", "train", "all, seen, unseen"),
+        ("variation_set", 44, "one of 42, 43"),
         ("camera_name", "corner4", "corner"),
         ("episode_length", 501, "1 to 500"),
         ("image_size", 8, "at least 16"),

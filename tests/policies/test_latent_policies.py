@@ -1,6 +1,7 @@
 import shutil
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -141,7 +142,8 @@ def test_only_the_policys_own_networks_are_trained(policy_paths: dict[str, Path]
 def test_iql_targets_follow_the_critics(policy_paths: dict[str, Path]) -> None:
     policy = load(policy_paths, "wm_iql")
     assert isinstance(policy, WMIQLPolicy)
-    pairs = list(zip(policy.target_critic.parameters(), policy.critic.parameters(), strict=True))
+    agent = policy.agent
+    pairs = list(zip(agent.target_critic.parameters(), agent.critic.parameters(), strict=True))
     assert any(not torch.equal(target, source) for target, source in pairs)  # they lag after 20 steps
     before = [target.clone() for target, _ in pairs]
     policy.update()
@@ -257,3 +259,60 @@ def test_policy_without_a_world_model(
         monkeypatch,
     )
     assert "--policy.world_model_path" in message
+
+
+@pytest.fixture(scope="module", params=POLICY_TYPES)
+def oracle(
+    request: pytest.FixtureRequest,
+    demos_root: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    lerobot_wm_command: Callable[..., None],
+) -> LatentPolicy:
+    """A policy on the full state in place of the latent, trained for a few steps."""
+    run_folder = tmp_path_factory.mktemp("oracle") / "run"
+    lerobot_wm_command(
+        f"train --policy.type={request.param} --policy.use_latent=false --policy.use_environment_state=true",
+        f"--steps=5 --batch_size=8 {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)}",
+        f"--output_dir={run_folder}",
+    )
+    checkpoint = run_folder / "checkpoints" / "last" / "pretrained_model"
+    return get_policy_class(request.param).from_pretrained(checkpoint)
+
+
+def test_state_oracle_acts_on_the_full_state(oracle: LatentPolicy, demos: LeRobotDataset) -> None:
+    assert set(oracle.config.input_features) == {"observation.state", "observation.environment_state"}
+    env_state = demos[0]["observation.environment_state"][None]  # (1, 39)
+    seen = frame(demos, 0)
+    action = oracle.select_action({**seen, "observation.environment_state": env_state})
+    moved = env_state + torch.eye(39)[37] * 0.1  # the goal, 10 cm away
+    assert not torch.equal(action, oracle.select_action({**seen, "observation.environment_state": moved}))
+    with pytest.raises(ValueError, match=r"--env\.environment_state=true"):
+        oracle.select_action(seen)
+
+
+def test_state_oracle_is_scaled_by_the_dataset(oracle: LatentPolicy, demos: LeRobotDataset) -> None:
+    states = torch.stack(list(demos.hf_dataset["observation.environment_state"]))  # (N, 39)
+    batch = {
+        "observation.state": states[:, :4],
+        "observation.environment_state": states,
+    }
+    scaled = oracle.observation_at(batch, torch.zeros(len(states), 2))[:, -39:]
+    varies = states.std(0) > 1e-4
+    torch.testing.assert_close(scaled.mean(0), torch.zeros(39), atol=1e-2, rtol=0)
+    torch.testing.assert_close(scaled.std(0)[varies], torch.ones(int(varies.sum())), atol=1e-2, rtol=0)
+
+
+def test_windows_are_read_as_frames_are(oracle: LatentPolicy, demos: LeRobotDataset) -> None:
+    keys = ("observation.state", "observation.environment_state")
+    tasks = torch.eye(2)[[0]]
+    window = {key: torch.stack([demos[0][key], demos[1][key]])[None] for key in keys}  # (1, 2, ·)
+    for t in (0, 1):
+        single = {key: demos[t][key][None] for key in keys}
+        assert torch.equal(oracle.observation_at(window, tasks, t), oracle.observation_at(single, tasks))
+
+
+def test_state_oracle_without_the_full_state_in_the_dataset(oracle: LatentPolicy) -> None:
+    config = deepcopy(oracle.config)
+    del config.input_features["observation.environment_state"]
+    with pytest.raises(ValueError, match=r"dataset has no 'observation\.environment_state'"):
+        config.validate_features()

@@ -2,10 +2,13 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from lerobot.scripts import lerobot_eval
+
+from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
 
 @pytest.mark.parametrize("policy_type", ["wm_bc", "wm_iql"])
@@ -35,3 +38,24 @@ def test_a_task_the_policy_does_not_know_ends_the_evaluation(
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", *flags.split()])
     with pytest.raises(ValueError, match=r"Unknown task \['Open a drawer'\]"):
         lerobot_eval.main()
+
+
+def test_the_state_oracle_is_given_the_state(
+    demos_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lerobot_wm_command: Callable[..., None]
+) -> None:
+    lerobot_wm_command(
+        "train --policy.type=wm_bc --policy.use_latent=false --policy.use_environment_state=true",
+        f"--steps=1 --batch_size=8 {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)}",
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    flags = (
+        f"--policy.path={tmp_path / 'run' / 'checkpoints' / 'last' / 'pretrained_model'} --policy.device=cpu "
+        "--env.type=metaworld_mt --env.task=reach-v3 --env.episode_length=4 --eval.n_episodes=1 --eval.batch_size=1 "
+        f"--eval.use_async_envs=false --seed=0 --output_dir={tmp_path / 'eval'}"
+    )
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *flags.split()])
+    with pytest.raises(ValueError, match=r"--env\.environment_state=true"):
+        lerobot_eval.main()
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *flags.split(), "--env.environment_state=true"])
+    lerobot_eval.main()
+    assert (tmp_path / "eval" / "eval_info.json").is_file()

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -12,7 +13,9 @@ from lerobot.utils.io_utils import write_video
 from PIL import Image
 
 from lerobot_wm import cli
+from lerobot_wm.report import build, videos
 from lerobot_wm.report.build import ReportConfig, ReportDatasetConfig, report
+from lerobot_wm.report.records import record_line
 
 VOID = {"meta", "img", "br"}
 
@@ -22,12 +25,13 @@ class Page(HTMLParser):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self.open, self.sources, self.headings, self.text = [], [], [], ""
+        self.open, self.sources, self.captions, self.headings, self.text = [], [], [], [], ""
         self.feed(path.read_text())
         assert not self.open
 
     def handle_starttag(self, tag: str, attrs: list) -> None:
-        self.sources += [(tag, value) for name, value in attrs if name in ("src", "href")]
+        self.sources += [(tag, value) for name, value in attrs if name in ("src", "href", "data-src")]
+        self.captions += [value for name, value in attrs if name == "data-caption"]
         if tag not in VOID:
             self.open.append(tag)
 
@@ -48,27 +52,41 @@ def test_records_alone(
     cli.main()
     printed = capsys.readouterr().out
     assert "50/50  100 [93, 100]" in printed
+    assert "+7.0 [" in printed, "wm_bc against wm_iql"
     assert f"{tmp_path}/report/index.html" in printed
 
     page = Page(tmp_path / "report" / "index.html")
-    assert page.headings == ["Success", "Where this comes from"]
+    assert page.headings == [
+        "Success per task",
+        "All tasks",
+        "Paired comparisons",
+        "Which variations fail",
+        "Where this comes from",
+    ]
     assert "R&D <1>" in page.text
-    assert re.search(r"100% *\[93, 100\] ·\s+50/50", page.text)
+    assert re.search(r"100% +50/50\s+\[93, 100\]", page.text)
+    assert "nearly BC" in page.text
     assert "lerobot-wm report" in page.text
-    assert page.sources == []
-    assert (
-        "| window-close-v3 | 50/50  100 [93, 100] | 47/50" in (tmp_path / "report" / "success.md").read_text()
-    )
+    assert [tag for tag, _ in page.sources] == ["img"], "seen and unseen"
+    markdown = (tmp_path / "report" / "success.md").read_text()
+    assert "| wm_bc | 19/50  38 [26, 52] | 50/50  100 [93, 100] |" in markdown
+    assert "## Success per task, unseen variations" in markdown
     assert not (tmp_path / "report" / "open_loop.png").exists()
 
 
-def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, episodes_root: Path) -> None:
-    evaluation = tmp_path / "eval"
-    (evaluation / "videos" / "reach-v3").mkdir(parents=True)
+def write_evaluation(folder: Path, *names: str) -> Path:
+    """An output folder of `lerobot-wm eval` for arm wm_bc, with videos on reach-v3."""
+    (folder / "videos" / "reach-v3").mkdir(parents=True)
     info = {"arm": "wm_bc", "provenance": {"command": "lerobot-wm eval --arm=wm_bc"}}
-    (evaluation / "eval_info.json").write_text(json.dumps(info))
-    video = evaluation / "videos" / "reach-v3" / "variation_03_failure.mp4"
-    write_video(video, [np.full((64, 64, 3), 10 * i, np.uint8) for i in range(8)], fps=80)
+    (folder / "eval_info.json").write_text(json.dumps(info))
+    for name in names:
+        frames = [np.full((64, 64, 3), 10 * i, np.uint8) for i in range(8)]
+        write_video(folder / "videos" / "reach-v3" / f"{name}.mp4", frames, fps=80)
+    return folder
+
+
+def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, episodes_root: Path) -> None:
+    evaluation = write_evaluation(tmp_path / "eval", "variation_04_failure")
     run = tmp_path / "world_model"
     run.mkdir()
     entries = [
@@ -87,24 +105,59 @@ def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, 
         )
     )
     page = Page(index)
-    assert page.headings == [
-        "Success",
-        "Rollouts",
+    assert page.headings[-4:] == [
+        "Which variations fail",
         "Open-loop prediction",
         "Training",
         "Where this comes from",
     ]
     kinds = [(tag, source.split(";")[0]) for tag, source in page.sources]
     assert kinds == [
-        ("video", "data:video/mp4"),
+        ("img", "data:image/svg+xml"),  # seen and unseen
+        ("button", "data:video/mp4"),
         ("img", "data:image/png"),
         ("img", "data:image/svg+xml"),  # kl
         ("img", "data:image/svg+xml"),  # loss
     ], "everything is in the page, and nothing else is loaded"
-    assert re.search(r"wm_bc\s*variation 3 · failure", page.text)
+    assert page.captions == ["reach-v3, wm_bc, variation 4: failure"]
     assert "lerobot-wm eval --arm=wm_bc" in page.text
     with Image.open(tmp_path / "report" / "open_loop.png") as picture:
         assert picture.width > 600
+
+
+def test_videos_beyond_the_limit_are_counted(
+    records_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_evaluation(tmp_path / "eval", "variation_00_success", "variation_04_failure")
+    size = max(video.stat().st_size for video in folder.rglob("*.mp4"))
+    monkeypatch.setattr(videos, "MAX_VIDEO_BYTES", size)
+    index = report(
+        ReportConfig(records=str(records_file), output_dir=tmp_path / "report", videos=str(folder))
+    )
+    page = Page(index)
+    assert page.captions == ["reach-v3, wm_bc, variation 4: failure"]
+    assert "1 of the 2 kept" in page.text
+
+
+def test_quality_is_included(records_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "quality_section", lambda path: f"<h2>Quality & {path.name}</h2>")
+    config = ReportConfig(
+        records=str(records_file), output_dir=tmp_path / "report", quality=Path("q/quality.json")
+    )
+    assert "<h2>Quality & quality.json</h2>" in report(config).read_text()
+
+
+def test_training_seeds_get_a_table_of_their_own(
+    tmp_path: Path, make_records: Callable, capsys: pytest.CaptureFixture
+) -> None:
+    paths = [tmp_path / "seed_0.jsonl", tmp_path / "seed_1.jsonl"]
+    for seed, path in enumerate(paths):
+        records = make_records("wm_bc", {"reach-v3": (4, 15 + seed)}, seed)
+        path.write_text("".join(map(record_line, records)))
+    index = report(ReportConfig(records=f"{tmp_path}/seed_*.jsonl", output_dir=tmp_path / "report"))
+    assert "39/100" in Page(index).text
+    assert "| wm_bc, seed 1 | 20/50  40 [28, 54] |" in (tmp_path / "report" / "success.md").read_text()
+    assert "Each training seed" not in capsys.readouterr().out
 
 
 def test_inputs_that_are_not_there_are_named(records_file: Path, tmp_path: Path) -> None:

@@ -10,7 +10,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 
-from lerobot_wm.constants import ACTION, OBS_IMAGE
+from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
+from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model, open_loop, strips_figure
 
 
@@ -50,6 +52,21 @@ def test_strips_show_truth_above_imagination(world_model_path: Path, episodes_ro
     np.testing.assert_array_equal(shown, results[1].truth[CONTEXT - 1 + HORIZONS[2]].transpose(1, 2, 0))
     shown = axes[3, 3].images[0].get_array()
     np.testing.assert_array_equal(shown, results[1].imagined[HORIZONS[2] - 1].transpose(1, 2, 0))
+
+
+def test_a_policy_that_is_blind_is_refused(world_model_path: Path, tmp_path: Path) -> None:
+    features = PreTrainedConfig.from_pretrained(world_model_path)
+    config = WMBCConfig(
+        use_latent=False,
+        tasks=["Reach a goal position"],
+        input_features={OBS_STATE: features.input_features[OBS_STATE]},
+        output_features=features.output_features,
+        device="cpu",
+        push_to_hub=False,
+    )
+    WMBCPolicy(config).save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=r"\(wm_bc\) holds no world model"):
+        load_world_model(str(tmp_path))
 
 
 def test_a_checkpoint_without_a_world_model_is_refused(world_model_path: Path, tmp_path: Path) -> None:

@@ -1,11 +1,12 @@
 """Reading records files, and what is refused."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from lerobot_wm.report.records import find_records, read_records
+from lerobot_wm.report.records import find_records, read_records, record_line
 
 
 def test_lists_and_globs(tmp_path: Path) -> None:
@@ -27,6 +28,20 @@ def test_a_repeated_rollout_is_refused(records_file: Path, tmp_path: Path) -> No
     again.write_text(records_file.read_text().splitlines()[3] + "\n")
     with pytest.raises(ValueError, match=r"again\.jsonl:1 repeats .*'reach-v3', 3.*records\.jsonl:4"):
         read_records([records_file, again])
+
+
+def test_one_arm_under_two_presets_is_refused(make_records: Callable, tmp_path: Path) -> None:
+    path = tmp_path / "records.jsonl"
+    records = make_records("wm_bc", {"reach-v3": (1, 1)})
+    other_seed = [r | {"seed": 1, "preset": "paper"} for r in records]
+    other_arm = [r | {"arm": "best_bc", "preset": "best"} for r in records]
+    path.write_text("".join(map(record_line, records + other_arm)))
+    assert len(read_records([path])) == 100, "arms may differ in their presets"
+    path.write_text("".join(map(record_line, records + other_seed)))
+    with pytest.raises(
+        ValueError, match=r"records\.jsonl:51: arm 'wm_bc' has preset 'paper' here, 'test' before"
+    ):
+        read_records([path])
 
 
 def test_lines_that_are_not_records_are_named(records_file: Path) -> None:

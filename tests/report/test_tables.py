@@ -1,62 +1,81 @@
-"""The tables' content and width."""
+"""The tables' renderings and width."""
 
 import io
 from collections.abc import Callable
 
 from rich.console import Console
 
+from lerobot_wm.report.arms import ARMS
 from lerobot_wm.report.statistics import SuccessRate
-from lerobot_wm.report.tables import markdown_table, table_by_run, table_by_split, terminal_tables
+from lerobot_wm.report.success import comparison_tables, overall_table, paper_comparison, task_table
+from lerobot_wm.report.tables import ReportTable, markdown_table, table_by_split, terminal_tables
 
 TASKS = {"button-press-topdown-v3": (10, 39), "reach-v3": (4, 15)}
+SIX = {
+    "button-press-topdown-v3": (10, 40),
+    "door-open-v3": (10, 40),
+    "drawer-open-v3": (10, 40),
+    "reach-v3": (10, 40),
+    "window-close-v3": (10, 40),
+    "window-open-v3": (10, 40),
+}
 
 
-def test_runs_across_tasks_down_totals_last(make_records: Callable) -> None:
-    records = make_records("wm_bc", TASKS) + make_records("wm_iql", {"reach-v3": (5, 20)})
-    table = table_by_run(records)
-    assert table.columns == ["wm_bc", "wm_iql"]
-    assert table.rows == {
-        "button-press-topdown-v3": [SuccessRate(49, 50), None],
-        "reach-v3": [SuccessRate(19, 50), SuccessRate(25, 50)],
-        "all tasks, seen": [SuccessRate(14, 20), SuccessRate(5, 10)],
-        "all tasks, unseen": [SuccessRate(54, 80), SuccessRate(20, 40)],
-        "all tasks": [SuccessRate(68, 100), SuccessRate(25, 50)],
-    }
-    assert table.n_totals == 3
-
-
-def test_training_seeds_are_columns_of_their_own(make_records: Callable) -> None:
-    records = make_records("wm_bc", TASKS, seed=0) + make_records("wm_bc", TASKS, seed=1)
-    assert table_by_run(records + make_records("blind", TASKS)).columns == [
-        "wm_bc seed 0",
-        "wm_bc seed 1",
-        "blind",
-    ]
+def printed(table: ReportTable) -> list[str]:
+    output = io.StringIO()
+    Console(file=output, width=100).print(*terminal_tables(table))
+    return output.getvalue().splitlines()
 
 
 def test_by_split(make_records: Callable) -> None:
     table = table_by_split("wm_bc", make_records("wm_bc", TASKS))
     assert table.columns == ["seen", "unseen", "all"]
-    assert table.rows["reach-v3"] == [SuccessRate(4, 10), SuccessRate(15, 40), SuccessRate(19, 50)]
-    assert table.rows["all tasks"] == [SuccessRate(14, 20), SuccessRate(54, 80), SuccessRate(68, 100)]
+    assert table.rows == [
+        ("button-press-topdown-v3", [SuccessRate(10, 10), SuccessRate(39, 40), SuccessRate(49, 50)]),
+        ("reach-v3", [SuccessRate(4, 10), SuccessRate(15, 40), SuccessRate(19, 50)]),
+        ("all tasks", [SuccessRate(14, 20), SuccessRate(54, 80), SuccessRate(68, 100)]),
+    ]
+    assert table.n_totals == 1
+    assert any("15/40  38 [24, 53]" in line for line in printed(table)), "in full where it fits"
 
 
-def test_environments_without_variations_have_no_splits(make_records: Callable) -> None:
+def test_environments_without_variations_have_one_column(make_records: Callable) -> None:
     records = [record | {"seen": None} for record in make_records("act", TASKS)]
     assert table_by_split("act", records).columns == ["all"]
-    assert list(table_by_run(records).rows) == [*TASKS, "all tasks"]
 
 
 def test_markdown(make_records: Callable) -> None:
-    lines = markdown_table(table_by_run(make_records("wm_bc", {"reach-v3": (4, 15)}))).splitlines()
-    assert lines[:3] == ["| task | wm_bc |", "|---|---:|", "| reach-v3 | 19/50  38 [26, 52] |"]
+    table = task_table("Success per task", make_records("wm_bc", {"reach-v3": (4, 15)}))
+    lines = markdown_table(table).splitlines()
+    assert lines[:5] == [
+        "## Success per task",
+        "",
+        "| arm | reach-v3 |",
+        "|---|---:|",
+        "| wm_bc | 19/50  38 [26, 52] |",
+    ]
+    assert lines[6] == table.notes[0]
 
 
-def test_terminal_tables_fit_100_columns(make_records: Callable) -> None:
-    records = [r for i in range(7) for r in make_records(f"frozen_bc_{i}", TASKS)]
-    output = io.StringIO()
-    Console(file=output, width=100).print(*terminal_tables(table_by_run(records)))
-    lines = output.getvalue().splitlines()
-    assert max(map(len, lines)) <= 100
-    # Nothing is wrapped or cut: each of the 7 runs shows its cell in full.
-    assert sum(line.count("49/50  98 [90, 100]") for line in lines) == 7
+def test_what_is_missing_is_a_dash() -> None:
+    table = ReportTable("t", "arm", ["reach-v3"], [("wm_bc", [None])])
+    assert "| wm_bc | – |" in markdown_table(table)
+
+
+def test_every_arm_fits_100_columns(make_records: Callable) -> None:
+    """Nothing is wrapped or cut at the widest: all arms, 150 of 150 in every cell."""
+    records = [r for arm in ARMS for seed in range(3) for r in make_records(arm, SIX, seed)]
+    tables = [task_table("", records), overall_table(records), paper_comparison(records)]
+    for table in tables + comparison_tables(records)[:1]:
+        lines = printed(table)
+        assert max(map(len, lines)) <= 100
+        for label, _ in table.rows:
+            assert any(line.startswith(f"{label} ") for line in lines), label
+    assert sum(line.count("100 98–100") for line in printed(tables[0])) == 6 * len(ARMS)
+
+
+def test_ten_tasks_are_cut_into_two_tables(make_records: Callable) -> None:
+    records = make_records("wm_bc", {f"task-{i}-v3": (10, 40) for i in range(10)})
+    text = "\n".join(printed(task_table("Success per task", records)))
+    assert text.count("Success per task") == 2
+    assert text.count("100 93–100") == 10

@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from lerobot_wm.constants import ACTION, OBS_LATENT, OBS_STATE
+from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
@@ -35,12 +35,12 @@ class WMBCPolicy(LatentPolicy):
         """Mean squared error on a batch of frames.
 
         Args:
-            batch: `observation.latent` (B, D+S), `observation.state` (B, P), `action` (B, A), `task` (B strings).
+            batch: `observation.latent` (B, L), `observation.state` (B, P), `action` (B, A), `task` (B strings), and
+                `observation.environment_state` (B, F) with `use_environment_state`.
 
         Returns:
             The scalar loss, and no parts: the loss is all there is.
         """
-        state = batch[OBS_STATE]
-        latent = batch[OBS_LATENT] if self.config.use_latent else None
-        observation = self.observation(state, self.one_hot_tasks(batch, state.shape[0]), latent)
+        tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
+        observation = self.observation_at(batch, tasks)  # (B, O)
         return bc_loss(self.actor(observation), self.action_scaling(batch[ACTION])), {}

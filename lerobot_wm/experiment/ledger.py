@@ -1,0 +1,78 @@
+"""The records of an experiment: every finished arm and seed once, in one file that is never half-written."""
+
+import os
+from pathlib import Path
+
+from lerobot_wm.experiment.preset import Preset
+from lerobot_wm.report.records import Record, read_records, record_line
+
+
+class Ledger:
+    """`records.jsonl` of an experiment, by (arm, seed).
+
+    An arm and seed is in it when each of its rollouts is, one on every variation of every task. It starts from
+    the committed results and what earlier runs have written; committed records win.
+
+    Args:
+        path: The file.
+        committed: Records that count although nothing else of their runs is left.
+        preset: Says which rollouts an arm and seed has.
+
+    Raises:
+        ValueError: a file holds something else than records.
+    """
+
+    def __init__(self, path: Path, committed: Path, preset: Preset) -> None:
+        self.path = path
+        self._rollouts = {(task, k) for task in preset.task_names for k in preset.variations}
+        self._runs: dict[tuple[str, int | None], list[Record]] = {}
+        for file in (path, committed):
+            if file.is_file() and file.stat().st_size:
+                self._runs |= {
+                    run: rows for run, rows in by_run(read_records([file])).items() if self._whole(rows)
+                }
+
+    def __contains__(self, run: tuple[str, int]) -> bool:
+        """Whether an arm and seed is finished."""
+        return run in self._runs
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is finished."""
+        return not self._runs
+
+    def add(self, arm: str, seed: int, files: list[Path]) -> None:
+        """Take the rollouts of a finished arm and seed; those it has already are left as they are.
+
+        Raises:
+            ValueError: the files hold other rollouts than these.
+        """
+        if (arm, seed) in self:
+            return
+        records = read_records(files)
+        if set(by_run(records)) != {(arm, seed)} or not self._whole(records):
+            found = sorted({(record["arm"], record["seed"]) for record in records}, key=str)
+            raise ValueError(
+                f"{', '.join(map(str, files))}: {len(records)} rollouts of (arm, seed) {found}; expected the "
+                f"{len(self._rollouts)} of ('{arm}', {seed}). Remove these folders to roll out again."
+            )
+        self._runs[arm, seed] = records
+        self.write()
+
+    def write(self) -> None:
+        """Replace the file at once."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = self.path.with_name(f"{self.path.name}.part")
+        unfinished.write_text("".join(record_line(record) for rows in self._runs.values() for record in rows))
+        os.replace(unfinished, self.path)
+
+    def _whole(self, records: list[Record]) -> bool:
+        return {(record["task"], record["variation"]) for record in records} == self._rollouts
+
+
+def by_run(records: list[Record]) -> dict[tuple[str, int | None], list[Record]]:
+    """Records by (arm, seed), in order."""
+    runs: dict[tuple[str, int | None], list[Record]] = {}
+    for record in records:
+        runs.setdefault((record["arm"], record["seed"]), []).append(record)
+    return runs

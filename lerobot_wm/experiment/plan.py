@@ -1,0 +1,196 @@
+"""The experiment as stages: which command makes what, from which other stage's result."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot.common.train_utils import get_step_checkpoint_dir
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import (
+    CHECKPOINTS_DIR,
+    LAST_CHECKPOINT_LINK,
+    OPTIMIZER_PARAM_GROUPS,
+    PRETRAINED_MODEL_DIR,
+    TRAINING_STATE_DIR,
+)
+
+from lerobot_wm.constants import ENV_TYPE, REPORTED_VARIATION_SET
+from lerobot_wm.experiment.arms import WM_RSSM, Arm, Encoder
+from lerobot_wm.experiment.commands import Checkpoint, Dataset, lerobot_wm
+from lerobot_wm.experiment.demonstrations import Demonstrations
+from lerobot_wm.experiment.preset import Preset
+from lerobot_wm.experiment.stage import Stage
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Builds the stages of an experiment.
+
+    Args:
+        preset: Its sizes.
+        output_dir: Where everything is written.
+        variation_set: The fixed positions that policies are rolled out on.
+    """
+
+    preset: Preset
+    output_dir: Path
+    variation_set: int = REPORTED_VARIATION_SET
+
+    @property
+    def demonstrations(self) -> Demonstrations:
+        """The data."""
+        return Demonstrations(self.preset, self.output_dir)
+
+    def evaluations(self, arm: Arm, seed: int) -> list[Stage]:
+        """The last stages of an arm and seed; each leaves a records.jsonl in its folder."""
+        if arm.config is None:
+            return [self._expert(arm)]
+        tasks = self.preset.task_names if arm.individual else [None]
+        return [self._evaluation(arm, seed, task) for task in tasks]
+
+    def policies(self, arm: Arm, seed: int) -> list[Stage]:
+        """The trainings of an arm and seed."""
+        if arm.config is None:
+            return []
+        tasks = self.preset.task_names if arm.individual else [None]
+        return [self._policy(arm, seed, task).made_by for task in tasks]
+
+    def world_model(self, seed: int) -> Checkpoint:
+        """The world model of `wm_bc` and `wm_iql`."""
+        return self._encoder(WM_RSSM, seed)
+
+    def quality(self, seed: int) -> Stage:
+        """How good the world model of this seed is on positions it was never trained on."""
+        world_model = self.world_model(seed)
+        training, held_out = self.demonstrations.sparse(), self.demonstrations.held_out()
+        name = f"seed_{seed}/quality"
+        folder = self.output_dir / name
+        flags = {"world_model_path": world_model.path, **held_out.flags(), **training.flags("train_dataset")}
+        return Stage(
+            name=name,
+            kind="quality",
+            argv=lerobot_wm("quality", {**flags, "output_dir": folder}),
+            folder=folder,
+            artefact=folder / "quality.json",
+            needs=(world_model.made_by, training.made_by, held_out.made_by),
+        )
+
+    def _encoder(self, encoder: Encoder, seed: int) -> Checkpoint:
+        source = self.demonstrations.sparse()
+        if encoder.config is not None:
+            return self._training(encoder.name, encoder.config, seed, source, *encoder.flags)
+        name = f"seed_{seed}/{encoder.name}"
+        folder = self.output_dir / name
+        path = folder / PRETRAINED_MODEL_DIR
+        stage = Stage(
+            name=name,
+            kind="init",
+            argv=lerobot_wm("init", {**source.flags(), "seed": seed, "output_dir": folder}, *encoder.flags),
+            folder=folder,
+            artefact=path,
+            needs=(source.made_by,),
+        )
+        return Checkpoint(stage, path)
+
+    def _latents(self, encoder: Encoder, seed: int) -> Dataset:
+        source, checkpoint = self.demonstrations.sparse(), self._encoder(encoder, seed)
+        name = f"seed_{seed}/latents_{encoder.name}"
+        folder, repo_id = self.output_dir / name, f"local/{self.preset.name}_{encoder.name}_{seed}"
+        flags = {"world_model_path": checkpoint.path, **source.flags()}
+        stage = Stage(
+            name=name,
+            kind="encode",
+            argv=lerobot_wm("encode", {**flags, "output_repo_id": repo_id, "output_root": folder}),
+            folder=folder,
+            artefact=folder / "meta" / "latents.json",
+            needs=(source.made_by, checkpoint.made_by),
+        )
+        return Dataset(stage, repo_id)
+
+    def _policy(self, arm: Arm, seed: int, task: str | None) -> Checkpoint:
+        assert arm.config is not None
+        run, flags = arm.training, list(arm.train_flags)
+        if arm.encoder is not None:
+            dataset = self._latents(arm.encoder, seed)
+            flags.append(f"--policy.world_model_path={self._encoder(arm.encoder, seed).path}")
+        else:
+            dataset = self.demonstrations.dense() if arm.dense_reward else self.demonstrations.sparse()
+        if task is not None:
+            # A collection's episodes are in the order of its tasks, equally many of each.
+            count, position = self.preset.episodes_per_task, self.preset.task_names.index(task)
+            episodes = ",".join(map(str, range(position * count, (position + 1) * count)))
+            run, flags = f"{run}_{task}", [*flags, f"--dataset.episodes=[{episodes}]"]
+        return self._training(run, arm.config, seed, dataset, *flags)
+
+    def _training(self, run: str, config: str, seed: int, dataset: Dataset, *more: str) -> Checkpoint:
+        name, settings = f"seed_{seed}/{run}", self.preset.settings(config)
+        folder = self.output_dir / name
+        steps = json.loads(settings.read_text())["steps"]
+        # Named by its step, not as "last": what is rolled out is the end of the training or nothing.
+        final = get_step_checkpoint_dir(folder, steps, steps)
+        last = folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
+        # Given again where a training goes on: the folders may have been moved since.
+        places = {"output_dir": folder, **dataset.flags()}
+        stage = Stage(
+            name=name,
+            kind=config,
+            argv=lerobot_wm(
+                "train", {"config_path": settings, "seed": seed, "job_name": run, **places}, *more
+            ),
+            folder=folder,
+            artefact=final / TRAINING_STATE_DIR / OPTIMIZER_PARAM_GROUPS,
+            needs=(dataset.made_by,),
+            checkpoint=last,
+            resume_argv=lerobot_wm("train", {"config_path": last, "resume": "true", **places}),
+        )
+        return Checkpoint(stage, final / PRETRAINED_MODEL_DIR)
+
+    def _evaluation(self, arm: Arm, seed: int, task: str | None) -> Stage:
+        preset, policy = self.preset, self._policy(arm, seed, task)
+        name = f"seed_{seed}/{self._prefix}_{arm.name}" + (f"_{task}" if task else "")
+        folder = self.output_dir / name
+        flags = {
+            "policy.path": policy.path,
+            "env.type": ENV_TYPE,
+            "env.task": task or preset.tasks,
+            "env.variation_set": self.variation_set,
+            "env.episode_length": preset.episode_length,
+            "eval.n_episodes": preset.rollouts_per_task,
+            "seed": preset.first_eval_seed,
+            "videos_per_task": preset.videos_per_task,
+            "output_dir": folder,
+            "arm": arm.name,
+            "preset": preset.name,
+        }
+        return Stage(
+            name=name,
+            kind="evaluate_task" if task else "evaluate",
+            argv=lerobot_wm("eval", flags, *arm.eval_flags),
+            folder=folder,
+            artefact=folder / "eval_info.json",
+            needs=(policy.made_by,),
+            takes_workers=True,
+        )
+
+    def _expert(self, arm: Arm) -> Stage:
+        name = f"{self._prefix}_{arm.name}"
+        folder = self.output_dir / name
+        flags = {
+            "tasks": self.preset.tasks,
+            "variation_set": self.variation_set,
+            "variations": ",".join(map(str, self.preset.variations)),
+            "output_dir": folder,
+            "preset": self.preset.name,
+        }
+        return Stage(
+            name=name,
+            kind="expert",
+            argv=lerobot_wm("expert", flags),
+            folder=folder,
+            artefact=folder / "records.jsonl",
+            takes_workers=True,
+        )
+
+    @property
+    def _prefix(self) -> str:
+        return "eval" if self.variation_set == REPORTED_VARIATION_SET else f"eval_set{self.variation_set}"

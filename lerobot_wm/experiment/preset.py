@@ -1,0 +1,122 @@
+"""Presets: the size of an experiment, as `configs/<preset>/experiment.json` beside its training settings."""
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from lerobot_wm.constants import NUM_VARIATIONS
+from lerobot_wm.envs.tasks import resolve_tasks
+from lerobot_wm.experiment.arms import ARMS, Arm
+
+CONFIGS = Path("configs")
+PRESET_FILE = "experiment.json"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What all arms of an experiment share.
+
+    Args:
+        folder: Where it was read from; its name is the preset's.
+        tasks: A task set or a comma-separated list.
+        episodes_per_task: Demonstrations of each task.
+        noise: Standard deviation of the noise on the expert's actions.
+        first_eval_seed: Variation of each task's first rollout.
+        rollouts_per_task: Rollouts of each task, on that variation and those after it.
+        episode_length: Steps after which a rollout is a failure.
+        videos_per_task: Rollouts of each task that are filmed, the first ones.
+        arms: Arms run when none are named, each with its training seeds.
+        minutes: Wall time expected of each kind of stage, until one of them has been measured.
+    """
+
+    folder: Path
+    tasks: str
+    episodes_per_task: int
+    noise: float
+    first_eval_seed: int
+    rollouts_per_task: int
+    episode_length: int
+    videos_per_task: int
+    arms: dict[str, list[int]]
+    minutes: dict[str, float]
+
+    @property
+    def name(self) -> str:
+        """As in records."""
+        return self.folder.name
+
+    @property
+    def task_names(self) -> tuple[str, ...]:
+        """The tasks one by one."""
+        return resolve_tasks(self.tasks)
+
+    @property
+    def variations(self) -> list[int]:
+        """The variations of each task's rollouts."""
+        seeds = range(self.first_eval_seed, self.first_eval_seed + self.rollouts_per_task)
+        return [seed % NUM_VARIATIONS for seed in seeds]
+
+    def settings(self, config: str) -> Path:
+        """A training settings file.
+
+        Raises:
+            FileNotFoundError: the preset has none of this name.
+        """
+        path = self.folder / f"{config}.json"
+        if not path.is_file():
+            raise FileNotFoundError(f"The preset '{self.name}' has no {path}: add it, or leave out its arms.")
+        return path
+
+
+def load_preset(name: str, configs: Path = CONFIGS) -> Preset:
+    """Read a preset.
+
+    Raises:
+        FileNotFoundError: there is none of this name.
+        ValueError: its fields are not those of `Preset`, or it names an unknown arm.
+    """
+    path = configs / name / PRESET_FILE
+    if not path.is_file():
+        found = sorted(file.parent.name for file in configs.glob(f"*/{PRESET_FILE}"))
+        raise FileNotFoundError(f"No preset '{name}': {path} is missing; there are {', '.join(found)}.")
+    data = json.loads(path.read_text())
+    expected = {field.name for field in fields(Preset)} - {"folder"}
+    if set(data) != expected:
+        wrong = sorted(set(data) ^ expected)
+        raise ValueError(f"{path} lacks or has too many of {wrong}; expected {sorted(expected)}.")
+    preset = Preset(folder=path.parent, **data)
+    for arm in preset.arms:
+        known_arm(arm)
+    return preset
+
+
+def known_arm(name: str) -> Arm:
+    """The arm of this name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in ARMS:
+        raise ValueError(f"No arm '{name}'; there are {', '.join(ARMS)}.")
+    return ARMS[name]
+
+
+def select_runs(preset: Preset, arms: list[str], seeds: list[int]) -> list[tuple[Arm, int]]:
+    """Every (arm, seed) asked for, in the order of tables.
+
+    Args:
+        preset: Gives the arms and the seeds that are not named.
+        arms: Names; the preset's when empty.
+        seeds: Training seeds of all of them; the preset's, or 0 where it has none, when empty. The scripted
+            expert is not trained and runs once.
+
+    Raises:
+        ValueError: an arm is unknown.
+    """
+    wanted = {known_arm(name).name for name in arms or preset.arms}
+    return [
+        (arm, seed)
+        for name, arm in ARMS.items()
+        if name in wanted
+        for seed in ([0] if arm.config is None else seeds or preset.arms.get(name, [0]))
+    ]

@@ -1,0 +1,94 @@
+"""`scripts/reproduce_table1.py`: any arms and seeds of the experiment, from nothing to the table."""
+
+import argparse
+import os
+import signal
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from lerobot_wm.constants import REPORTED_VARIATION_SET, VARIATION_SETS
+from lerobot_wm.experiment.arms import ARMS
+from lerobot_wm.experiment.experiment import Experiment
+from lerobot_wm.experiment.lock import exclusive
+from lerobot_wm.experiment.plan import Plan
+from lerobot_wm.experiment.preset import load_preset, select_runs
+from lerobot_wm.experiment.stage import Stage
+
+LOG_TAIL = 15  # lines of a failed stage's log that are shown
+
+
+def show_failures(failed: list[Stage], console: Console) -> None:
+    """Name what failed, each with the end of its log."""
+    for stage in failed:
+        lines = stage.log.read_text(errors="replace").splitlines()[-LOG_TAIL:]
+        console.print(f"\n[red]{stage.name} failed.[/] The end of {stage.log}:", highlight=False)
+        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description="Table 1 of the paper with controls: any arms and seeds, from demonstrations to the report. Safe "
+        "to stop and start again: finished stages are never repeated, trainings go on from their last checkpoint, "
+        "and an arm and seed whose records are complete counts as done.",
+        epilog=f"Arms: {', '.join(ARMS)}.",
+    )
+    parser.add_argument("--preset", required=True, help="a folder of configs/ with an experiment.json")
+    parser.add_argument("--arms", default="", help="names separated by commas; the preset's by default")
+    parser.add_argument(
+        "--seeds", default="", help="training seeds separated by commas; the preset's by default"
+    )
+    parser.add_argument("--output_dir", type=Path, help="outputs/PRESET by default")
+    parser.add_argument("--results_dir", type=Path, help="committed records; results/PRESET by default")
+    parser.add_argument(
+        "--processes", type=int, default=os.cpu_count(), help="stages side by side (%(default)s)"
+    )
+    parser.add_argument(
+        "--variation_set",
+        type=int,
+        choices=VARIATION_SETS,
+        default=REPORTED_VARIATION_SET,
+        help="positions to roll out on: 42 is the table, 43 is for choosing settings and recorded apart",
+    )
+    parser.add_argument(
+        "--quality", action="store_true", help="judge the world model, too (lerobot-wm quality)"
+    )
+    parser.add_argument("--list", action="store_true", help="print the stages and their state, then exit")
+    return parser
+
+
+def main() -> None:
+    """Entry point of `scripts/reproduce_table1.py`."""
+    args = parser().parse_args()
+    console = Console()
+    try:
+        preset = load_preset(args.preset)
+        runs = select_runs(preset, _names(args.arms), [int(seed) for seed in _names(args.seeds)])
+        output_dir = args.output_dir or Path("outputs") / preset.name
+        results_dir = args.results_dir or Path("results") / preset.name
+        plan = Plan(preset, output_dir, args.variation_set)
+        if args.processes < 1:
+            raise ValueError(f"--processes={args.processes}: expected at least 1.")
+        if args.list:
+            Experiment(plan, runs, results_dir, args.processes, args.quality).show(console)
+            return
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
+        with exclusive(output_dir) as lock:
+            experiment = Experiment(plan, runs, results_dir, args.processes, args.quality)
+            failed = experiment.run(lock, console)
+            reported = experiment.report()
+    except (ValueError, OSError) as error:
+        sys.exit(f"reproduce_table1: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\nStopped. The same command goes on from here.")
+    show_failures(failed, console)
+    if failed:
+        sys.exit(f"{len(failed)} stages failed; the same command tries them again.")
+    if not reported:
+        sys.exit("The report failed, for the reason above; the records are complete.")
+
+
+def _names(comma_separated: str) -> list[str]:
+    return [name.strip() for name in comma_separated.split(",") if name.strip()]

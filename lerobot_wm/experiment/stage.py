@@ -1,0 +1,86 @@
+"""A stage of the experiment: one command, and the file that says it is finished."""
+
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One subprocess of the experiment.
+
+    Args:
+        name: Unique within the experiment.
+        kind: Stages of one kind take about as long.
+        argv: Its command.
+        folder: What it writes; a start from nothing removes it first.
+        artefact: The file it writes last: there is one exactly when the stage is finished.
+        needs: Stages that must be finished before.
+        checkpoint: The file a stopped stage goes on from; None when it has to start from nothing.
+        resume_argv: The command to go on with.
+        takes_workers: Whether it spreads over the cores it is given by `--num_workers`.
+    """
+
+    name: str
+    kind: str
+    argv: tuple[str, ...]
+    folder: Path
+    artefact: Path
+    needs: tuple["Stage", ...] = ()
+    checkpoint: Path | None = None
+    resume_argv: tuple[str, ...] = ()
+    takes_workers: bool = False
+
+    @property
+    def log(self) -> Path:
+        """What the command prints, beside what it writes."""
+        return self.folder.with_name(f"{self.folder.name}.log")
+
+    @property
+    def finished(self) -> bool:
+        """Whether its artefact is there."""
+        return self.artefact.exists()
+
+    @property
+    def resumes(self) -> bool:
+        """Whether a stopped run of it left something to go on from."""
+        return self.checkpoint is not None and self.checkpoint.exists()
+
+    def command(self, cores: int) -> list[str]:
+        """The command to run now, with the cores it may use."""
+        argv = self.resume_argv if self.resumes else self.argv
+        return [*argv, f"--num_workers={cores}"] if self.takes_workers else list(argv)
+
+    def prepare(self) -> None:
+        """Make room: the folder of its log, and no left-overs where it starts from nothing."""
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        if not self.resumes and self.folder.exists():
+            shutil.rmtree(self.folder)
+
+
+def in_order(targets: Iterable[Stage]) -> dict[str, Stage]:
+    """`targets` and all they need, by name, each after those it needs."""
+    return _closure(targets, lambda stage: True)
+
+
+def unfinished(targets: Iterable[Stage]) -> dict[str, Stage]:
+    """The stages still to run for `targets`, by name, each after those it needs.
+
+    What a finished stage needed is not looked at: it may have been removed since.
+    """
+    return _closure(targets, lambda stage: not stage.finished)
+
+
+def _closure(targets: Iterable[Stage], wanted: Callable[[Stage], bool]) -> dict[str, Stage]:
+    stages: dict[str, Stage] = {}
+
+    def visit(stage: Stage) -> None:
+        if stage.name not in stages and wanted(stage):
+            for need in stage.needs:
+                visit(need)
+            stages[stage.name] = stage
+
+    for target in targets:
+        visit(target)
+    return stages

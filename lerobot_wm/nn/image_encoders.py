@@ -1,0 +1,67 @@
+"""Image encoders of the end-to-end baselines: GroupNorm CNN, learned spatial embeddings, bottleneck (PTR-style)."""
+
+from functools import partial
+
+import torch
+import torchvision
+from torch import Tensor, nn
+
+from lerobot_wm.nn.spatial_embeddings import SpatialEmbeddings
+
+FEATURE_DIM = 256
+
+_GROUPS = 4
+_SMALL_CHANNELS = 32
+_SMALL_STRIDES = (2, 2, 1, 1)
+# PTR's strides are 2, 2, 2, 1, 1 for stem, max pooling and residual stages 2 to 4; torchvision's are 2 everywhere.
+# The last two stages keep their resolution, so that 64x64 pixels leave a map of 8x8.
+_UNSTRIDED_STAGES = ("layer3", "layer4")
+
+
+def _small(image_channels: int) -> nn.Sequential:
+    """Four 3x3 convolutions of 32 channels: a quarter of the image's resolution."""
+    layers: list[nn.Module] = []
+    for i, stride in enumerate(_SMALL_STRIDES):
+        c_in = _SMALL_CHANNELS if i else image_channels
+        layers += [
+            nn.Conv2d(c_in, _SMALL_CHANNELS, kernel_size=3, stride=stride, padding=1, bias=False),
+            nn.GroupNorm(_GROUPS, _SMALL_CHANNELS),
+            nn.ReLU(inplace=True),
+        ]
+    return nn.Sequential(*layers)
+
+
+def _resnet(name: str, image_channels: int) -> nn.Sequential:
+    """torchvision's ResNet from scratch, with GroupNorm and an eighth of the image's resolution."""
+    model = torchvision.models.get_model(name, weights=None, norm_layer=partial(nn.GroupNorm, _GROUPS))
+    model.conv1 = nn.Conv2d(image_channels, 64, kernel_size=7, stride=2, padding=3, bias=False)
+    for stage in _UNSTRIDED_STAGES:
+        first = model.get_submodule(stage)[0]
+        first.conv1.stride = first.downsample[0].stride = (1, 1)
+    return nn.Sequential(*list(model.children())[:-2])  # without average pooling and classifier
+
+
+class ImageEncoder(nn.Module):
+    """Image -> 256 features in (-1, 1): CNN, learned spatial embeddings, linear, LayerNorm, tanh.
+
+    Args:
+        name: "small", or torchvision's "resnet18" or "resnet34".
+        image_shape: (C, H, W) of the images; the embeddings hold weights for this size only.
+    """
+
+    def __init__(self, name: str, image_shape: tuple[int, int, int]) -> None:
+        super().__init__()
+        channels = image_shape[0]
+        self.backbone = _small(channels) if name == "small" else _resnet(name, channels)
+        with torch.no_grad():
+            feature_map = self.backbone(torch.zeros(1, *image_shape))  # (1, C', H', W')
+        self.embeddings = SpatialEmbeddings(*feature_map.shape[1:])
+        self.bottleneck = nn.Sequential(
+            nn.Linear(self.embeddings.output_dim, FEATURE_DIM), nn.LayerNorm(FEATURE_DIM), nn.Tanh()
+        )
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Map images (N, C, H, W) in [0, 1] to features (N, 256)."""
+        # As in nn.conv: the activations are channels-last for speed, the weights are not for LeRobot's saving.
+        features = self.backbone(images.contiguous(memory_format=torch.channels_last))  # (N, C', H', W')
+        return self.bottleneck(self.embeddings(features))

@@ -1,0 +1,130 @@
+"""`lerobot-wm expert`: the scripted expert as an arm, one rollout without noise on each variation."""
+
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import draccus
+import numpy as np
+from rich.console import Console
+from tqdm import tqdm
+
+from lerobot_wm.constants import MAX_EPISODE_STEPS, NUM_VARIATIONS, REPORTED_VARIATION_SET
+from lerobot_wm.envs.simulation import Simulation
+from lerobot_wm.envs.tasks import resolve_tasks
+from lerobot_wm.envs.variations import check_variation_set, is_seen, parse_variations
+from lerobot_wm.pipeline.collect_episode import demonstrate
+from lerobot_wm.pipeline.quiet import quiet, silence
+from lerobot_wm.report.records import Record, record_line
+from lerobot_wm.report.tables import table_by_split, terminal_tables
+
+ARM = "expert"
+
+
+@dataclass
+class ExpertConfig:
+    """Flags of `lerobot-wm expert`."""
+
+    # Folder of records.jsonl.
+    output_dir: Path
+    # A task, a set (mt6, mt10, mt50) or a comma-separated list.
+    tasks: str = "mt6"
+    # Set of variations: 42, on which results are reported, or 43, for choosing settings and for probes.
+    variation_set: int = REPORTED_VARIATION_SET
+    # Variations to roll out on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
+    variations: str = f"0-{NUM_VARIATIONS - 1}"
+    # Name of the settings in records.
+    preset: str = "custom"
+    # Processes; each takes whole tasks.
+    num_workers: int = 2
+
+    def validate(self) -> None:
+        """Refuse what cannot run.
+
+        Raises:
+            ValueError: a flag names what does not exist.
+            FileExistsError: the records file is there already.
+        """
+        resolve_tasks(self.tasks)
+        check_variation_set(self.variation_set)
+        parse_variations(self.variations)
+        if self.num_workers < 1:
+            raise ValueError(f"--num_workers={self.num_workers}: expected at least 1.")
+        if self.records_file.exists():
+            raise FileExistsError(
+                f"{self.records_file} holds earlier records: remove it, or give another --output_dir."
+            )
+
+    @property
+    def records_file(self) -> Path:
+        """The records file to write."""
+        return self.output_dir / "records.jsonl"
+
+
+def roll_out_expert(cfg: ExpertConfig) -> list[Record]:
+    """Roll the experts out and write their records, as `lerobot-wm eval` writes a policy's.
+
+    Raises:
+        ValueError, FileExistsError: see `ExpertConfig.validate`.
+    """
+    cfg.validate()
+    tasks = resolve_tasks(cfg.tasks)
+    records = [
+        record for of_task in tqdm(_rollouts(cfg, tasks), total=len(tasks), unit="task") for record in of_task
+    ]
+    cfg.output_dir.mkdir(parents=True, exist_ok=True)
+    unfinished = cfg.records_file.with_name(f"{cfg.records_file.name}.part")
+    unfinished.write_text("".join(map(record_line, records)))
+    unfinished.rename(cfg.records_file)
+    return records
+
+
+def _rollouts(cfg: ExpertConfig, tasks: tuple[str, ...]) -> Iterator[list[Record]]:
+    """Records task by task, in the order of `tasks`."""
+    if cfg.num_workers == 1:
+        with quiet():
+            yield from map(partial(_roll_out, cfg), tasks)
+        return
+    with ProcessPoolExecutor(
+        min(cfg.num_workers, len(tasks)), mp_context=get_context("spawn"), initializer=silence
+    ) as pool:
+        yield from pool.map(partial(_roll_out, cfg), tasks)
+
+
+def _roll_out(cfg: ExpertConfig, task: str) -> list[Record]:
+    simulation = Simulation(task, cfg.variation_set)
+    return [_record(cfg, simulation, variation) for variation in parse_variations(cfg.variations)]
+
+
+def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record:
+    """One rollout: as in the environment, it ends with success or after 500 steps, and success is the reward."""
+    rng = np.random.default_rng(0)  # draws nothing that matters: the noise has no width
+    demonstration = demonstrate(simulation, variation, noise=0.0, steps_after_success=0, rng=rng)
+    success = demonstration is not None
+    return {
+        "arm": ARM,
+        "policy_type": "scripted",
+        "preset": cfg.preset,
+        "seed": 0,
+        "task": simulation.task,
+        "variation": variation,
+        "seen": is_seen(variation, cfg.variation_set),
+        "success": success,
+        "steps": MAX_EPISODE_STEPS if demonstration is None else len(demonstration.actions),
+        "return": float(success),
+    }
+
+
+def main() -> None:
+    """Entry point of `lerobot-wm expert`."""
+    try:
+        cfg = draccus.parse(ExpertConfig, args=sys.argv[1:])
+        records = roll_out_expert(cfg)
+    except (ValueError, FileExistsError) as error:
+        sys.exit(f"lerobot-wm expert: {error}")
+    Console(width=100).print(*terminal_tables(table_by_split("Success of the scripted expert", records)))
+    print(f"Records: {cfg.records_file}")

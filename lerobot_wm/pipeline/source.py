@@ -1,0 +1,18 @@
+"""The dataset a command reads, as flags."""
+
+from dataclasses import dataclass
+
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+
+@dataclass
+class SourceConfig:
+    """`--dataset.repo_id`, `--dataset.root`, `--dataset.revision` as in `lerobot-train`."""
+
+    repo_id: str
+    root: str | None = None
+    revision: str | None = None
+
+    def open(self) -> LeRobotDataset:
+        """The dataset, all of its episodes; downloaded where it is not on this machine."""
+        return LeRobotDataset(self.repo_id, root=self.root, revision=self.revision)

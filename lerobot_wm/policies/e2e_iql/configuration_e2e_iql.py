@@ -1,0 +1,17 @@
+"""Configuration of multi-task implicit Q-learning from pixels."""
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_wm.policies.e2e_config import E2EConfig
+from lerobot_wm.policies.iql_config import IQLConfig
+
+
+@PreTrainedConfig.register_subclass("e2e_iql")
+@dataclass
+class E2EIQLConfig(IQLConfig, E2EConfig):
+    """IQL from pixels with the settings of IQL on latents (paper section 3.2).
+
+    It learns from the dataset's `next.reward`, whichever reward that is.
+    """

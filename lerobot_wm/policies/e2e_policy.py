@@ -1,0 +1,74 @@
+"""A policy trained from pixels: an image encoder under the heads of the policies on latents."""
+
+from typing import Any
+
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from torch import Tensor
+
+from lerobot_wm.constants import OBS_STATE
+from lerobot_wm.nn.augment import random_crop
+from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder
+from lerobot_wm.policies.e2e_config import E2EConfig
+from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
+
+
+class E2EPolicy(MultiTaskPolicy):
+    """Base of `e2e_bc` and `e2e_iql`. Subclasses define `actor_mean` and `forward`."""
+
+    config: E2EConfig
+    observation_dim: int  # of the heads' input: image features, one-hot task, proprioception
+
+    def __init__(
+        self,
+        config: E2EConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        super().__init__(config, dataset_stats, dataset_meta)
+        config.input_features = {key: config.input_features[key] for key in (config.camera, OBS_STATE)}
+        self.observation_dim = FEATURE_DIM + len(config.tasks) + config.state_dim
+        self.encoder = ImageEncoder(config.encoder, config.image_shape)
+
+    def observation(self, images: Tensor, state: Tensor, tasks: Tensor) -> Tensor:
+        """Encode the images and join the heads' input.
+
+        Args:
+            images: The camera, (B, C, H, W) in [0, 1]; shifted at random in training where the configuration says so.
+            state: Proprioception in the dataset's units, (B, P).
+            tasks: One-hot task ids, (B, N).
+
+        Returns:
+            [image features, one-hot task, scaled proprioception], (B, O).
+        """
+        if self.training and self.config.random_crop_pad:
+            images = random_crop(images, self.config.random_crop_pad)
+        return torch.cat([self.encoder(images), tasks, self.state_scaling(state)], dim=-1)
+
+    def reset(self) -> None:
+        """Nothing to reset: the policy has no memory."""
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """Act on the current image: the policy's mean action, clipped to the dataset's range.
+
+        Args:
+            batch: The camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings).
+            **kwargs: Not used; LeRobot passes options of other policies.
+
+        Returns:
+            Actions in the dataset's units, (B, A).
+
+        Raises:
+            ValueError: The image has another size than in training, or the task is unknown.
+        """
+        images, state = batch[self.config.camera], batch[OBS_STATE]
+        found, expected = tuple(images.shape[1:]), self.config.image_shape
+        if found != expected:
+            raise ValueError(
+                f"'{self.config.camera}' is {found}, this policy was trained on {expected} (C, H, W): set the "
+                f"camera or environment to {expected[1]}x{expected[2]} (--env.image_size={expected[1]} for "
+                "metaworld_mt)."
+            )
+        observation = self.observation(images, state, self.one_hot_tasks(batch, state.shape[0]))
+        return self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))

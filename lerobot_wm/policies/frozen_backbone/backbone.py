@@ -1,0 +1,120 @@
+"""A frozen image backbone that stands where a world model stands: its latent is the image's pooled features."""
+
+import difflib
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+import torchvision
+from torch import Tensor, nn
+from torchvision.transforms.v2 import functional as vision
+
+from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import RGB_CHANNELS, BackboneConfig
+
+TIMM_PREFIX = "timm/"
+# Mean and standard deviation of ImageNet's pixels, which published weights expect (torchvision, timm, R3M).
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class BackboneState:
+    """The features of frames, `latent` (B, T, F) or (B, F): each depends on its own image alone."""
+
+    latent: Tensor
+
+    def last(self) -> Self:
+        """The state after the last of T frames, (B, F)."""
+        return type(self)(self.latent[:, -1])
+
+
+class FrozenBackbone(nn.Module):
+    """A torchvision or timm model without its classifier, on images with ImageNet's normalisation.
+
+    It has the part of `WorldModel`'s interface that encoding and acting need (`FrozenEncoder`); actions,
+    proprioception and earlier states are accepted there and not used.
+
+    Raises:
+        ValueError: There is no such model, or it takes no images of `config.image_size`.
+        ImportError: timm is asked for and not installed.
+    """
+
+    def __init__(self, config: BackboneConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.model = make_model(config.name)
+        self.requires_grad_(False).eval()
+        config.latent_dim = self._feature_dim()
+
+    def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
+        """Pooled features of images (B, T, 3, H, W) in [0, 1]: (B, T, F)."""
+        size = [self.config.image_size] * 2
+        flat = vision.normalize(
+            vision.resize(images.flatten(0, 1), size, antialias=True), list(IMAGENET_MEAN), list(IMAGENET_STD)
+        )  # (B·T, 3, S, S)
+        return self.model(flat).unflatten(0, images.shape[:2])
+
+    def observe(
+        self,
+        images: Tensor,
+        prev_actions: Tensor,
+        state: BackboneState | None = None,
+        proprio: Tensor | None = None,
+        *,
+        sample: bool = False,
+    ) -> BackboneState:
+        """The features of images (B, T, 3, H, W) in [0, 1]; see `WorldModel.observe`."""
+        return BackboneState(self.embed(images))
+
+    def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> BackboneState:
+        """The features themselves, (B, T, F); see `WorldModel.filter_embeds`."""
+        return BackboneState(embeds)
+
+    @torch.no_grad()
+    def _feature_dim(self) -> int:
+        """F, found by trying: no table of models knows which image sizes they take."""
+        size = self.config.image_size
+        try:
+            features = self.embed(torch.zeros(1, 1, RGB_CHANNELS, size, size))
+        except (AssertionError, RuntimeError) as error:
+            raise ValueError(
+                f"{self.config.name} takes no images of {size}x{size} ({error}): set --policy.backbone_image_size, "
+                "224 for most models with fixed positions."
+            ) from error
+        return features.shape[-1]
+
+
+def make_model(name: str) -> nn.Module:
+    """A randomly initialised backbone that maps normalised images (N, 3, H, W) to pooled features (N, F).
+
+    Raises:
+        ValueError: There is no such model, or it has no pooled features.
+        ImportError: timm is asked for and not installed.
+    """
+    if name.startswith(TIMM_PREFIX):
+        return _make_timm_model(name.removeprefix(TIMM_PREFIX))
+    known = torchvision.models.list_models(module=torchvision.models)
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=3)
+        raise ValueError(
+            f"torchvision has no classification model '{name}'; {'close are' if close else 'it has'} "
+            f"{', '.join(close or known)}. timm's are named timm/NAME."
+        )
+    model = torchvision.models.get_model(name, weights=None)
+    # torchvision's classifiers end in one linear layer, applied to pooled features.
+    linear = [path for path, module in model.named_modules() if isinstance(module, nn.Linear)]
+    if not linear:
+        raise ValueError(f"{name} pools class scores, not features: choose another model, such as resnet18.")
+    model.set_submodule(linear[-1], nn.Identity())
+    return model
+
+
+def _make_timm_model(name: str) -> nn.Module:
+    try:
+        import timm
+    except ImportError as error:
+        raise ImportError(f"--policy.backbone=timm/{name} needs timm: run `pip install timm`.") from error
+    if not timm.is_model(name):
+        close = difflib.get_close_matches(name, timm.list_models(), n=3)
+        raise ValueError(f"timm has no model '{name}'{f'; close are {", ".join(close)}' if close else ''}.")
+    return timm.create_model(name, pretrained=False, num_classes=0)

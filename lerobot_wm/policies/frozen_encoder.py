@@ -1,0 +1,67 @@
+"""What a latent policy holds and a dataset is encoded with: a world model, or an image backbone in its place."""
+
+from typing import Any, Protocol
+
+from lerobot.configs import PreTrainedConfig
+from torch import Tensor
+
+from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
+from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy, resize_images
+from lerobot_wm.world_model.model import WorldModel
+
+EncoderPolicy = WMRSSMPolicy | FrozenBackbonePolicy
+
+
+class LatentState(Protocol):
+    """The state of an encoder after one frame, (B, ·), or after each of T frames, (B, T, ·)."""
+
+    @property
+    def latent(self) -> Tensor:
+        """s_t, (B, L) or (B, T, L)."""
+
+    def last(self) -> "LatentState":
+        """The state after the last of T frames."""
+
+
+class FrozenEncoder(Protocol):
+    """The interface that `WorldModel` and `FrozenBackbone` have in common; both are modules.
+
+    Whole episodes are encoded by `embed` and then `filter_embeds`, a running episode frame by frame by `observe`: the
+    latents are the same. Images are (B, T, C, H, W) in [0, 1], actions (B, T, A) and proprioception (B, T, P) in the
+    dataset's units; an encoder ignores what it does not read.
+    """
+
+    def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
+        """Embeddings e_t, each of its own frame alone: (B, T, E)."""
+
+    def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> LatentState:
+        """States for embeddings of whole episodes, given the action a_t executed at each frame."""
+
+    def observe(
+        self, images: Tensor, prev_actions: Tensor, state: Any = None, proprio: Tensor | None = None
+    ) -> LatentState:
+        """States for the next frames, given the action a_{t-1} before each and the state before the first."""
+
+
+def load_encoder(path: str) -> EncoderPolicy:
+    """The checkpoint of an encoder, which it holds as `.world_model`.
+
+    Args:
+        path: Folder or Hub id of a wm_rssm or frozen_backbone checkpoint.
+
+    Raises:
+        ValueError: It is a checkpoint of another type.
+    """
+    config = PreTrainedConfig.from_pretrained(path)
+    if isinstance(config, WMRSSMConfig):
+        return WMRSSMPolicy.from_pretrained(path, config=config)
+    if isinstance(config, FrozenBackboneConfig):
+        return FrozenBackbonePolicy.from_pretrained(path, config=config)
+    raise ValueError(f"{path} is a {config.type} checkpoint; expected one of a wm_rssm or a frozen_backbone.")
+
+
+def encoder_images(encoder: FrozenEncoder, images: Tensor) -> Tensor:
+    """Images (..., C, H, W) in [0, 1] as the encoder takes them: a world model at its own size, a backbone at any."""
+    return resize_images(images) if isinstance(encoder, WorldModel) else images

@@ -1,0 +1,41 @@
+"""Settings of implicit Q-learning, for every configuration of a policy trained by it."""
+
+from dataclasses import dataclass, field
+
+from lerobot_wm.policies.multi_task_config import MultiTaskConfig
+from lerobot_wm.policies.optim import ActorCosineConfig
+
+
+@dataclass
+class IQLConfig(MultiTaskConfig):
+    """The paper's IQL settings (section 3.1.2), the rest from the IQL reference implementation.
+
+    It comes first among the base classes of a policy's configuration: it sets the schedule and the frames read.
+
+    Args:
+        beta: Inverse temperature; it multiplies the advantage. With a 0/1 reward that ends the episode Q and V lie in
+            [0, 1], so at 0.5 every weight exp(β·A) lies in [0.61, 1.65]: IQL is then nearly BC. At evaluation it
+            picks the actor among `trained_betas`.
+        sweep_betas: Further inverse temperatures, an actor each, trained beside the main one on the same critics; 0 is
+            behaviour cloning by likelihood. In e2e_iql the image encoder is shaped by the main actor alone.
+        expectile: Expectile τ of the value regression.
+        discount: γ.
+        target_rate: Polyak rate of the target critics.
+        trained_betas: β of every actor, the main one first; filled when the policy is made.
+    """
+
+    beta: float = 0.5
+    sweep_betas: list[float] = field(default_factory=list)
+    expectile: float = 0.7
+    discount: float = 0.99
+    target_rate: float = 0.005
+    trained_betas: list[float] = field(default_factory=list)
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """Observations at t and t+1."""
+        return [0, 1]
+
+    def get_scheduler_preset(self) -> ActorCosineConfig:
+        """Cosine decay on the actors only."""
+        return ActorCosineConfig()

@@ -1,0 +1,84 @@
+"""What a policy on latents settles when it is made: its encoder, what it reads, and that latents are its own."""
+
+from pathlib import Path
+
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
+from lerobot_wm.data.fingerprint import weights_fingerprint
+from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.policies.features import stat
+from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
+from lerobot_wm.policies.frozen_encoder import load_encoder
+from lerobot_wm.policies.latent_config import LatentPolicyConfig
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from lerobot_wm.world_model.model import WorldModel
+
+_MIN_FEATURE_STD = 1e-5  # below it, scaling features to unit variance would scale rounding errors
+
+
+def adopt_encoder(config: LatentPolicyConfig) -> WorldModel | FrozenBackbone:
+    """Load the world model, or the backbone in its place, and note its sizes in `config`.
+
+    Raises:
+        ValueError: `world_model_path` is not given, or is no checkpoint of either.
+    """
+    if config.world_model_path is None:
+        raise ValueError(
+            f"--policy.type={config.type} needs --policy.world_model_path=<folder or Hub id of a wm_rssm checkpoint>."
+        )
+    policy = load_encoder(config.world_model_path)
+    if isinstance(policy, WMRSSMPolicy):
+        config.rssm = policy.world_model.config
+    else:
+        config.frozen_backbone = policy.world_model.config
+    config.image_key = policy.config.image_key
+    config.input_features[config.image_key] = policy.config.input_features[config.image_key]
+    config.world_model_fingerprint = weights_fingerprint(policy.world_model)
+    return policy.world_model
+
+
+def make_encoder(config: LatentPolicyConfig) -> WorldModel | FrozenBackbone:
+    """The encoder a checkpoint's configuration describes, to be filled with its weights."""
+    if config.rssm is not None:
+        return WorldModel(config.rssm)
+    assert config.frozen_backbone is not None  # a policy with latents has one of the two
+    return FrozenBackbone(config.frozen_backbone)
+
+
+def deployed_features(config: LatentPolicyConfig) -> dict[str, PolicyFeature]:
+    """What the policy reads at test time: camera and proprioception, not the stored latent.
+
+    Raises:
+        ValueError: The dataset has no proprioception.
+    """
+    wanted = {OBS_STATE, config.image_key, OBS_ENV_STATE if config.use_environment_state else None}
+    features = {key: feature for key, feature in config.input_features.items() if key in wanted}
+    if OBS_STATE not in features or features[OBS_STATE].type is not FeatureType.STATE:
+        raise ValueError(f"The dataset has no '{OBS_STATE}'; it has {sorted(config.input_features)}.")
+    return features
+
+
+def check_latents(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> None:
+    """Refuse a dataset without latents, with those of another world model, or with features that hold nothing.
+
+    Raises:
+        ValueError: Says how to encode it.
+    """
+    if OBS_LATENT not in dataset_meta.features:
+        raise ValueError(
+            f"{dataset_meta.repo_id} has no '{OBS_LATENT}'. Encode it with the world model first (`lerobot-wm encode "
+            f"--world_model_path=... --dataset.repo_id={dataset_meta.repo_id} ...`), or train with `lerobot-wm train`, "
+            "which does so by itself."
+        )
+    record = LatentRecord.read(Path(dataset_meta.root))
+    record.check_world_model(config.world_model_fingerprint, config.world_model_path)
+    if config.frozen_backbone is not None:
+        std = stat(dataset_meta.stats, OBS_LATENT, "std").median().item()
+        if std < _MIN_FEATURE_STD:
+            raise ValueError(
+                f"The features of {config.frozen_backbone.name} hardly vary (median standard deviation {std:.1e}): "
+                "without trained weights its signal fades from layer to layer. Give --policy.weights_path to "
+                "`lerobot-wm init`, or choose a residual network such as resnet18."
+            )

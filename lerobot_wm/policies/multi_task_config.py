@@ -1,0 +1,70 @@
+"""What the configurations of all policies that act have in common."""
+
+from dataclasses import dataclass, field
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig
+
+from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, default_dtype, feature_dim
+from lerobot_wm.policies.optim import FusedAdamConfig
+
+
+@dataclass
+class MultiTaskConfig(PreTrainedConfig):
+    """A policy for one or several tasks: small networks, one-hot task ids, Adam at a constant rate.
+
+    Args:
+        hidden_dims: Widths of the hidden layers of every head.
+        dropout: Dropout of the actor.
+        lr: Learning rate of Adam.
+        dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in.
+        tasks: Task strings in one-hot order, taken from the dataset when the policy is made.
+    """
+
+    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
+    dropout: float = 0.1
+    lr: float = 3e-4
+    dtype: str | None = None
+    tasks: list[str] = field(default_factory=list)
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict(IDENTITY_NORMALIZATION)
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dtype is None:
+            self.dtype = default_dtype(str(self.device))
+
+    @property
+    def state_dim(self) -> int:
+        """Size of the proprioceptive state."""
+        return feature_dim(self.input_features, OBS_STATE, "The dataset")
+
+    @property
+    def action_dim(self) -> int:
+        """Size of the action."""
+        return feature_dim(self.output_features, ACTION, "The dataset")
+
+    @property
+    def observation_delta_indices(self) -> list[int] | None:
+        """Single frames."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int] | None:
+        """Single frames."""
+        return None
+
+    @property
+    def reward_delta_indices(self) -> list[int] | None:
+        """Single frames."""
+        return None
+
+    def get_optimizer_preset(self) -> FusedAdamConfig:
+        """Adam without clipping (IQL reference implementation)."""
+        return FusedAdamConfig(lr=self.lr)
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        """A constant learning rate."""
+        return None

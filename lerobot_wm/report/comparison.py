@@ -1,0 +1,97 @@
+"""Paired comparison of two arms over the rollouts that both made."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binomtest
+
+from lerobot_wm.report.arms import COMPARED_ARMS, by_arm
+from lerobot_wm.report.bootstrap import RNG_SEED, percentile_interval, resample
+from lerobot_wm.report.records import Record
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Success of `arm` minus that of `other`, in percentage points, over `n_pairs` rollouts of each.
+
+    `only_arm` and `only_other` count the pairs where just that one succeeded. `p_value` is that of the exact
+    McNemar test, None where the pairs come from several training seeds and are not independent.
+    """
+
+    arm: str
+    other: str
+    n_pairs: int
+    difference: float
+    interval: tuple[float, float]
+    only_arm: int
+    only_other: int
+    p_value: float | None
+
+    @property
+    def verdict(self) -> str:
+        """The interval in words."""
+        low, high = self.interval
+        if low > 0:
+            return "better (interval excludes zero)"
+        if high < 0:
+            return "worse (interval excludes zero)"
+        return "no difference shown"
+
+
+def compare(records: list[Record], others: list[Record]) -> Comparison | None:
+    """Compare two arms over the rollouts (seed, task, variation) that both have; None where they share none.
+
+    The difference is averaged over the shared seeds of a variation, the variations of a task and then the tasks. The
+    interval is a percentile bootstrap that resamples variations within each task: a variation is drawn with all of
+    its seeds, since rollouts on one variation are not independent. It covers the choice of variations; the training
+    seeds are taken as they are.
+    """
+    ours, theirs = _outcomes(records), _outcomes(others)
+    shared = sorted(ours.keys() & theirs.keys(), key=str)
+    if not shared:
+        return None
+    by_variation: dict[str, dict[int, list[int]]] = {}  # task -> variation -> differences by seed
+    for seed, task, variation in shared:
+        pair = (seed, task, variation)
+        by_variation.setdefault(task, {}).setdefault(variation, []).append(ours[pair] - theirs[pair])
+    rng = np.random.default_rng(RNG_SEED)
+    differences, draws = [], []
+    for variations in by_variation.values():
+        clusters = np.array([np.mean(seeds) for seeds in variations.values()])  # (V,)
+        differences.append(clusters.mean())
+        draws.append(resample(clusters, rng).mean(axis=1))  # (N,)
+    only_arm = sum(ours[pair] > theirs[pair] for pair in shared)
+    only_other = sum(ours[pair] < theirs[pair] for pair in shared)
+    single_seed = len({seed for seed, _, _ in shared}) == 1
+    return Comparison(
+        arm=records[0]["arm"],
+        other=others[0]["arm"],
+        n_pairs=len(shared),
+        difference=100 * float(np.mean(differences)),
+        interval=percentile_interval(100 * np.mean(draws, axis=0)),
+        only_arm=only_arm,
+        only_other=only_other,
+        p_value=_mcnemar(only_arm, only_other) if single_seed else None,
+    )
+
+
+def compare_arms(records: list[Record]) -> dict[str, list[Comparison]]:
+    """Each arm of `COMPARED_ARMS` against every other arm that shares rollouts with it, in the order of tables."""
+    arms = by_arm(records)
+    compared = {
+        arm: [compare(arms[arm], arms[other]) for other in arms if other != arm]
+        for arm in COMPARED_ARMS
+        if arm in arms
+    }
+    found = {arm: [c for c in results if c is not None] for arm, results in compared.items()}
+    return {arm: results for arm, results in found.items() if results}
+
+
+def _outcomes(records: list[Record]) -> dict[tuple[int | None, str, int], bool]:
+    return {(record["seed"], record["task"], record["variation"]): record["success"] for record in records}
+
+
+def _mcnemar(only_arm: int, only_other: int) -> float:
+    """Two-sided exact McNemar test: under equality each discordant pair is a fair coin (McNemar 1947)."""
+    discordant = only_arm + only_other
+    return float(binomtest(only_arm, discordant).pvalue) if discordant else 1.0

@@ -1,0 +1,134 @@
+"""Figures of world-model quality, drawn from quality.json (and the example images from memory)."""
+
+from textwrap import fill
+from typing import Any
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+EXAMPLES_NAME = "quality_examples.png"
+EXAMPLE_HORIZON = 20
+# Colour-blind safe (Okabe and Ito 2008); the model itself in the page's blue.
+_COLOURS = ("#2f6fde", "#d55e00", "#7a7a7a", "#b8b8b8", "#009e73")
+_LABELS = {"foreground_psnr": "foreground PSNR (dB)", "psnr": "PSNR (dB)", "ssim": "SSIM"}
+
+
+def quality_figures(result: dict[str, Any]) -> dict[str, Figure]:
+    """The figures of a quality.json by name."""
+    return {
+        "open_loop": _open_loop_figure(pd.DataFrame(result["open_loop"])),
+        "probes": _probes_figure(pd.DataFrame(result["probes"])),
+        "kl": _kl_figure(result["kl"]),
+        "drift": _drift_figure(pd.DataFrame(result["drift"]), result["settings"]["restart"]),
+    }
+
+
+def examples_figure(images: dict[str, Tensor], tasks: list[str], horizons: tuple[int, ...]) -> Figure:
+    """One row per task: the last frame seen, the truth EXAMPLE_HORIZON steps on, and the predictions of it.
+
+    Args:
+        images: As `quality_open_loop.predictions` returns them, each (E, H, C, h, w).
+        tasks: The task of each of the E episodes; the first of each is shown.
+        horizons: The H horizons.
+    """
+    columns = ("copy last frame", "truth", "closed loop", "open loop", "shuffled actions")
+    names = list(dict.fromkeys(tasks))
+    figure = Figure(figsize=(1.5 * (len(columns) + 0.8), 1.6 * len(names)), layout="constrained")
+    axes = figure.subplots(len(names), len(columns), squeeze=False)
+    for row, task in zip(axes, names, strict=True):
+        episode = tasks.index(task)
+        row[0].set_ylabel(fill(task, 16), fontsize=8, rotation=0, ha="right", va="center")
+        for axis, column in zip(row, columns, strict=True):
+            image = images[column][episode, horizons.index(EXAMPLE_HORIZON)].movedim(0, -1)  # (h, w, C)
+            axis.imshow(image.numpy(), interpolation="nearest")
+            axis.set_xticks([])
+            axis.set_yticks([])
+    for axis, column in zip(axes[0], columns, strict=True):
+        axis.set_title("last seen" if column == "copy last frame" else column, fontsize=9)
+    return figure
+
+
+def _open_loop_figure(table: pd.DataFrame) -> Figure:
+    """Error against horizon over all tasks (the last of the table), one line per prediction."""
+    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    overall = table[table["task"] == table["task"].iloc[-1]]
+    for axes, (column, label) in zip(figure.subplots(1, 3), _LABELS.items(), strict=True):
+        for colour, (prediction, group) in zip(
+            _COLOURS, overall.groupby("prediction", sort=False), strict=True
+        ):
+            axes.plot(
+                group["horizon"],
+                group[column],
+                "o-",
+                color=colour,
+                markersize=3,
+                linewidth=1.2,
+                label=prediction,
+            )
+        axes.set_xlabel("steps ahead", fontsize=8)
+        _tidy(axes, label)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    return figure
+
+
+def _probes_figure(table: pd.DataFrame) -> Figure:
+    """Median error per task, one panel per target and one mark per representation."""
+    targets = list(table["target"].unique())
+    tasks = list(table["task"].unique())
+    figure = Figure(figsize=(9, 0.3 * len(tasks) + 1.3), layout="constrained")
+    panels = figure.subplots(1, len(targets), sharey=True)
+    for axes, target in zip(panels, targets, strict=True):
+        of_target = table[table["target"] == target]
+        for colour, (name, group) in zip(
+            _COLOURS, of_target.groupby("representation", sort=False), strict=True
+        ):
+            rows = [tasks.index(task) for task in group["task"]]
+            axes.scatter(group["median_cm"], rows, s=22, color=colour, label=name)
+        axes.set_xlim(left=0)
+        axes.set_xlabel("median error (cm)", fontsize=8)
+        axes.set_yticks(range(len(tasks)), [fill(task, 30) for task in tasks])
+        _tidy(axes, target)
+    panels[0].invert_yaxis()
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    return figure
+
+
+def _kl_figure(kl: dict[str, Any]) -> Figure:
+    figure = Figure(figsize=(4.4, 2.6), layout="constrained")
+    axes = figure.subplots()
+    axes.stairs(kl["histogram"]["counts"], kl["histogram"]["edges"], fill=True, color=_COLOURS[0], alpha=0.6)
+    axes.axvline(kl["free_nats"], color=_COLOURS[1], linewidth=1.2, label="free nats")
+    axes.set_xlabel("KL(posterior || prior) per step (nats)", fontsize=8)
+    axes.legend(fontsize=8)
+    _tidy(axes, "steps")
+    return figure
+
+
+def _drift_figure(table: pd.DataFrame, restart: int) -> Figure:
+    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot(table["step"], table["psnr"], color=_COLOURS[0], linewidth=1.2, label="from the first frame on")
+    left.plot(
+        table["step"],
+        table["restarted_psnr"],
+        "--",  # it hides nothing where both are equal
+        color=_COLOURS[1],
+        linewidth=1.2,
+        label=f"restarted {restart - 1} steps before",
+    )
+    right.plot(table["step"], table["kl"], color=_COLOURS[0], linewidth=1.2)
+    right.set_yscale("log")
+    for axes, label in ((left, "reconstruction PSNR (dB)"), (right, "KL per step (nats)")):
+        axes.axvline(restart, color="#7a7a7a", linewidth=0.8, linestyle="--")
+        axes.set_xlabel("step of the episode", fontsize=8)
+        _tidy(axes, label)
+    left.legend(fontsize=8)
+    return figure
+
+
+def _tidy(axes: Axes, title: str) -> None:
+    axes.set_title(title, fontsize=10)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.3)

@@ -1,0 +1,153 @@
+"""The networks and losses of an implicit Q-learning agent (Kostrikov et al. 2021)."""
+
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_wm.nn.mlp import MLP, orthogonal_init
+from lerobot_wm.rl import iql
+
+
+class GaussianActor(nn.Module):
+    """N(tanh MLP, exp(log_std)) with a standard deviation that does not depend on the observation."""
+
+    def __init__(
+        self, observation_dim: int, action_dim: int, hidden_dims: Sequence[int], dropout: float
+    ) -> None:
+        super().__init__()
+        self.mlp = MLP(observation_dim, hidden_dims, action_dim, nn.ReLU, dropout)
+        self.log_std = nn.Parameter(torch.zeros(action_dim))
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean (B, A), in (-1, 1), and log-std (A,) for observations (B, O)."""
+        return self.mlp(observation).tanh(), self.log_std
+
+
+class TwinCritic(nn.Module):
+    """Two independent Q functions of (observation, action)."""
+
+    def __init__(self, input_dim: int, hidden_dims: Sequence[int]) -> None:
+        super().__init__()
+        self.critics = nn.ModuleList(MLP(input_dim, hidden_dims, 1, nn.ReLU) for _ in range(2))
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Q values (2, B) for observations (B, O) and actions (B, A)."""
+        x = torch.cat([observation, action], dim=-1)
+        return torch.stack([critic(x).squeeze(-1) for critic in self.critics])
+
+
+class IQLAgent(nn.Module):
+    """Twin critics with Polyak targets, a value function, and one actor per inverse temperature β.
+
+    All losses of a step are taken at the same parameters and descended together: LeRobot's loop makes one
+    backward pass and one optimizer step. The reference updates V before Q uses it; the lag is one step.
+
+    Args:
+        observation_dim: O.
+        action_dim: A.
+        betas: β of each actor. IQL learns Q and V without an actor, so that all actors share them. The first is the
+            main one. The others send no gradient into the observations: without dropout, whose masks come from one
+            generator, the main actor's training is bit for bit the same with and without them.
+        hidden_dims: Widths of the hidden layers of every network.
+        dropout: Dropout of the actors.
+        expectile: τ of the value regression.
+        discount: γ.
+        target_rate: Polyak rate of the target critics.
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        *,
+        betas: Sequence[float],
+        hidden_dims: Sequence[int],
+        dropout: float,
+        expectile: float,
+        discount: float,
+        target_rate: float,
+    ) -> None:
+        super().__init__()
+        self.betas = list(betas)
+        self.expectile = expectile
+        self.discount = discount
+        self.target_rate = target_rate
+
+        def make_actor() -> GaussianActor:
+            return GaussianActor(observation_dim, action_dim, hidden_dims, dropout)
+
+        self.actors = nn.ModuleList([make_actor()])
+        self.critic = TwinCritic(observation_dim + action_dim, hidden_dims)
+        self.value = MLP(observation_dim, hidden_dims, 1, nn.ReLU)
+        for network in (self.actors, self.critic, self.value):
+            orthogonal_init(network)
+        self.target_critic = deepcopy(self.critic).requires_grad_(False)
+        # Made last: they take nothing from the random numbers the networks above are made of.
+        for _ in self.betas[1:]:
+            self.actors.append(make_actor())
+        orthogonal_init(self.actors[1:])
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Three optimizer groups, the actors first: only their learning rate decays."""
+        return [{"params": list(network.parameters())} for network in (self.actors, self.critic, self.value)]
+
+    def mean_action(self, observation: Tensor, beta: float) -> Tensor:
+        """Mean (B, A) of the actor trained with `beta`, scaled to [-1, 1], for observations (B, O)."""
+        return self.actors[self.betas.index(beta)](observation)[0]
+
+    def loss(
+        self,
+        observation: Tensor,
+        next_observation: Tensor,
+        action: Tensor,
+        reward: Tensor,
+        terminal: Tensor,
+        has_next: Tensor,
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Value, critic and actor losses on a batch of transitions.
+
+        Args:
+            observation: At t, (B, O). Critic, value and main actor send gradients into it.
+            next_observation: At t+1, (B, O), used without gradient.
+            action: Scaled to [-1, 1], (B, A).
+            reward: (B,).
+            terminal: (B,) bool, True where the step ends the task; a time limit does not.
+            has_next: (B,) bool, False where the data ends at t and `next_observation` is no successor.
+
+        Returns:
+            The sum of the losses and its parts by name; those of further actors are `actor_loss_beta<β>`.
+        """
+        with torch.no_grad():
+            target_q = self.target_critic(observation, action).amin(0)  # (B,)
+            next_v = self.value(next_observation).squeeze(-1)  # (B,)
+        v = self.value(observation).squeeze(-1)  # (B,)
+        qs = self.critic(observation, action)  # (2, B)
+        target = iql.critic_target(reward, next_v, terminal, self.discount)  # (B,)
+        advantage = target_q - v  # (B,)
+        losses = {
+            "value_loss": iql.value_loss(target_q, v, self.expectile),
+            # The last frame of an episode has no successor: without success there it cannot be bootstrapped.
+            "critic_loss": iql.critic_loss(qs, target, terminal | has_next),
+        }
+        for i, (beta, actor) in enumerate(zip(self.betas, self.actors, strict=True)):
+            mean, log_std = actor(observation if i == 0 else observation.detach())  # (B, A), (A,)
+            log_prob = iql.gaussian_log_prob(mean, log_std, action)  # (B,)
+            name = "actor_loss" if i == 0 else f"actor_loss_beta{beta:g}"
+            losses[name] = iql.actor_loss(iql.advantage_weight(advantage, beta), log_prob)
+        monitors = {
+            "q": qs.mean(),
+            "v": v.mean(),
+            "advantage": advantage.mean(),
+            "weight": iql.advantage_weight(advantage, self.betas[0]).mean(),
+        }
+        values = torch.stack([*losses.values(), *monitors.values()]).tolist()  # one transfer from the device
+        return torch.stack(list(losses.values())).sum(), dict(zip([*losses, *monitors], values, strict=True))
+
+    @torch.no_grad()
+    def update_target(self) -> None:
+        """Move the target critics towards the critics."""
+        for target, source in zip(self.target_critic.parameters(), self.critic.parameters(), strict=True):
+            target.lerp_(source, self.target_rate)

@@ -1,0 +1,41 @@
+#!/usr/bin/env bash
+# The paper's world-model arms at the paper's sizes on one GPU machine, in one call: demonstrations, world model,
+# latents, wm_bc and wm_iql side by side, 300 rollouts of each, report.
+#
+#   scripts/paper_gpu.sh          the preset `paper`
+#   scripts/paper_gpu.sh smoke    the same path in minutes on two CPU cores
+#
+# The work goes to outputs/<preset>, what is worth keeping to $OUT (outputs/paper_gpu by default). Called again it
+# goes on where it stopped. PYTHON names an interpreter that has the project installed, to use in place of .venv.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+unset PYTHONDONTWRITEBYTECODE
+
+PRESET="${1:-paper}"
+OUT="${OUT:-outputs/paper_gpu}"
+if [[ -z "${PYTHON:-}" ]]; then
+  bash scripts/setup.sh
+  PYTHON=.venv/bin/python
+fi
+mkdir -p "$OUT"
+
+# Records that were committed do not count here: the machine is to do the work.
+status=0
+"$PYTHON" scripts/reproduce_table1.py --preset="$PRESET" --arms=wm_bc,wm_iql --seeds=0 --results_dir="$OUT" || status=$?
+
+for file in records.jsonl times.json report/index.html report/success.md report/open_loop.png; do
+  if [[ -e "outputs/$PRESET/$file" ]]; then
+    cp "outputs/$PRESET/$file" "$OUT/"
+  fi
+done
+"$PYTHON" - "$PRESET" "$SECONDS" >"$OUT/provenance.json" <<'END'
+import json
+import sys
+
+from lerobot_wm.report.provenance import provenance
+
+command = f"scripts/paper_gpu.sh {sys.argv[1]}"
+print(json.dumps({**provenance(), "command": command, "wall_seconds": int(sys.argv[2])}, indent=2))
+END
+printf '%s: %d min %d s (exit code %d)\n' "$OUT" $((SECONDS / 60)) $((SECONDS % 60)) "$status"
+exit "$status"

@@ -1,0 +1,91 @@
+"""Paired comparisons: known differences, clusters of seeds, and how often the interval holds the truth."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from lerobot_wm.report.comparison import compare, compare_arms
+from lerobot_wm.report.records import Record
+
+TASKS = {"reach-v3": (5, 20), "window-close-v3": (10, 30)}
+
+
+def with_outcomes(records: list[Record], outcomes: np.ndarray) -> list[Record]:
+    return [record | {"success": bool(success)} for record, success in zip(records, outcomes, strict=True)]
+
+
+def test_known_difference_and_mcnemar(make_records: Callable) -> None:
+    ours = make_records("wm_bc", {"reach-v3": (10, 8)})
+    theirs = make_records("proprio_bc", {"reach-v3": (5, 5)})
+    found = compare(ours, theirs)
+    assert (found.arm, found.other, found.n_pairs) == ("wm_bc", "proprio_bc", 50)
+    assert found.difference == pytest.approx(16)
+    assert (found.only_arm, found.only_other) == (8, 0)
+    assert found.p_value == pytest.approx(2 / 2**8)
+    assert found.verdict == "better (interval excludes zero)"
+
+    reverse = compare(theirs, ours)
+    assert reverse.difference == pytest.approx(-16)
+    assert reverse.interval == pytest.approx((-found.interval[1], -found.interval[0]), abs=2)
+    assert reverse.verdict == "worse (interval excludes zero)"
+
+
+def test_equal_arms(make_records: Callable) -> None:
+    found = compare(make_records("wm_bc", TASKS), make_records("wm_iql", TASKS))
+    assert (found.difference, found.interval, found.p_value) == (0, (0, 0), 1)
+    assert found.verdict == "no difference shown"
+
+
+def test_tasks_weigh_the_same(make_records: Callable) -> None:
+    ours = [r for r in make_records("a", {"x": (10, 40), "y": (0, 0)}) if r["task"] == "x" or r["seen"]]
+    assert compare(ours, make_records("b", {"x": (0, 0), "y": (0, 0)})).difference == pytest.approx(50)
+
+
+def test_seeds_of_one_variation_are_not_independent(make_records: Callable) -> None:
+    """Five seeds that do the very same must not narrow the interval."""
+
+    def five(arm: str, successes: dict) -> list[Record]:
+        return [r for seed in range(5) for r in make_records(arm, successes, seed)]
+
+    other = {"reach-v3": (2, 10), "window-close-v3": (9, 10)}
+    one = compare(make_records("wm_bc", TASKS), make_records("e2e_bc", other))
+    several = compare(five("wm_bc", TASKS), five("e2e_bc", other))
+    assert several.n_pairs == 5 * one.n_pairs
+    assert several.interval == pytest.approx(one.interval)
+    assert several.p_value is None
+
+
+def test_only_shared_rollouts_count(make_records: Callable) -> None:
+    ours = make_records("wm_bc", TASKS, seed=0) + make_records("wm_bc", {"reach-v3": (0, 0)}, seed=1)
+    theirs = make_records("state_bc", {"reach-v3": (5, 20)}, seed=0)
+    found = compare(ours, theirs)
+    assert (found.n_pairs, found.difference) == (50, 0)
+    assert found.p_value == 1, "one shared seed: the pairs are independent"
+    assert compare(ours, make_records("state_bc", TASKS, seed=7)) is None
+
+
+def test_world_model_arms_are_compared_with_every_other(make_records: Callable) -> None:
+    records = [r for arm in ("mine", "proprio_bc", "wm_bc", "e2e_iql") for r in make_records(arm, TASKS)]
+    elsewhere = make_records("expert", TASKS, seed=3)
+    found = compare_arms(records + elsewhere)
+    assert {arm: [c.other for c in results] for arm, results in found.items()} == {
+        "wm_bc": ["e2e_iql", "proprio_bc", "mine"]
+    }
+    assert compare_arms(make_records("wm_bc", TASKS)) == {}
+
+
+def test_the_interval_holds_the_truth(make_records: Callable) -> None:
+    """Variations of three seeds share their difficulty; the expected difference over variations is the truth."""
+    rng = np.random.default_rng(0)
+    ours = [r for seed in range(3) for r in make_records("wm_bc", TASKS, seed)]  # (3 seeds, 2 tasks, 50)
+    theirs = [r | {"arm": "e2e_bc"} for r in ours]
+    hits = 0
+    for _ in range(100):
+        chance = np.tile(rng.beta(2, 1, 100), 3)
+        other = np.tile(rng.beta(1, 1, 100), 3)
+        found = compare(
+            with_outcomes(ours, rng.random(300) < chance), with_outcomes(theirs, rng.random(300) < other)
+        )
+        hits += found.interval[0] <= 100 * (2 / 3 - 1 / 2) <= found.interval[1]
+    assert hits >= 88

@@ -1,0 +1,35 @@
+"""Training curves: which runs share a line's colour and name."""
+
+import json
+from pathlib import Path
+
+from lerobot_wm.report.curves import curve_figures, read_logs
+
+
+def write_log(run: Path, **values: float) -> Path:
+    run.mkdir(parents=True)
+    lines = [{"step": step, "update_s": 0.1} | values for step in (100, 200)]
+    (run / "train_log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return run
+
+
+def test_seeds_of_an_arm_do_not_hide_each_other(tmp_path: Path) -> None:
+    runs = [write_log(tmp_path / f"seed_{seed}" / arm, loss=seed) for seed in (0, 1) for arm in ("a", "b")]
+    logs = read_logs(runs)
+    assert list(logs) == ["seed_0/a", "seed_0/b", "seed_1/a", "seed_1/b"]
+    [figure] = curve_figures(logs)
+    lines = figure.axes[0].lines
+    assert [line.get_ydata()[0] for line in lines] == [0, 1, 0, 1], "seed by seed of a, then of b"
+    assert lines[0].get_color() == lines[1].get_color() != lines[2].get_color()
+    assert [text.get_text() for text in figure.legends[0].texts] == ["a", "b"]
+
+
+def test_one_run_needs_no_legend(tmp_path: Path) -> None:
+    logs = read_logs([write_log(tmp_path / "wm_rssm", loss=1, kl=3)])
+    figures = curve_figures(logs)
+    assert [figure.axes[0].get_title() for figure in figures] == ["kl", "loss"]
+    assert not figures[0].legends
+
+
+def test_no_runs_have_no_curves() -> None:
+    assert curve_figures(read_logs([])) == []

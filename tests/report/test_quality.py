@@ -1,0 +1,128 @@
+"""`lerobot-wm quality`, from datasets and a checkpoint to quality.json, figures and the section of the page."""
+
+import json
+import logging
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import torch
+
+from lerobot_wm.report import quality
+from lerobot_wm.report.open_loop import load_world_model
+from lerobot_wm.report.quality_page import quality_section
+
+
+class Section(HTMLParser):
+    """What a section shows; fails on tags that do not nest and on anything that is not inlined."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open, self.images, self.text = [], 0, ""
+        self.feed(html)
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list) -> None:
+        for name, value in attrs:
+            assert name not in ("src", "href") or value.startswith("data:image/")
+        if tag == "img":
+            self.images += 1
+        else:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += " ".join(data.split()) + " "
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *flags: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["lerobot-wm quality", *flags])
+    quality.main()
+
+
+def test_by_cross_validation(
+    demos_root: Path, world_model_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    run(
+        monkeypatch,
+        f"--world_model_path={world_model_path}",
+        "--dataset.repo_id=test/demos",
+        f"--dataset.root={demos_root}",
+        f"--output_dir={out}",
+        "--episodes_per_task=3",
+    )
+    result = json.loads((out / "quality.json").read_text())
+    assert result["n_episodes"] == 6
+    assert result["n_episodes_of_seen_positions"] is None
+    assert {row["task"] for row in result["probes"]} >= {"Reach a goal position", "Push and close a window"}
+    assert {row["horizon"] for row in result["open_loop"]} == {1, 5, 10, 20, 45}
+    assert sum(result["kl"]["histogram"]["counts"]) == sum(t["n_steps"] for t in result["kl"]["tasks"][:-1])
+    assert sorted(path.name for path in out.glob("*.[ps][nv]g")) == [
+        "quality_drift.svg",
+        "quality_examples.png",
+        "quality_kl.svg",
+        "quality_open_loop.svg",
+        "quality_probes.svg",
+    ]
+
+    section = Section(quality_section(out / "quality.json"))
+    assert section.images == 5
+    reach = next(
+        row
+        for row in result["probes"]
+        if (row["task"], row["target"], row["representation"])
+        == ("Reach a goal position", "goal", "latent s_t")
+    )
+    shown = section.text[section.text.index("Position of the goal") :]
+    assert f"{reach['median_cm']:.1f} {reach['mean_cm']:.1f} · {reach['r2']:.2f}" in shown
+    assert "was not checked" in section.text
+    assert "average precision" in section.text
+
+    result["reward"] = None  # as for a model without a reward head
+    (out / "quality.json").write_text(json.dumps(result))
+    assert "average precision" not in Section(quality_section(out / "quality.json")).text
+
+
+def test_fitted_on_the_training_data(
+    demos_root: Path,
+    world_model_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        run(
+            monkeypatch,
+            f"--world_model_path={world_model_path}",
+            "--dataset.repo_id=test/demos",
+            f"--dataset.root={demos_root}",
+            "--train_dataset.repo_id=test/demos",
+            f"--train_dataset.root={demos_root}",
+            f"--output_dir={tmp_path}",
+            "--episodes_per_task=2",
+        )
+    assert "4 of 4 episodes start from positions of the training data" in caplog.text
+    text = Section(quality_section(tmp_path / "quality.json")).text
+    assert "4 of them start from object and goal positions of its training data" in text
+
+
+def test_the_untrained_model_has_other_weights_and_the_same_scaling(world_model_path: Path) -> None:
+    trained = load_world_model(str(world_model_path)).world_model
+    trained.action_scaling.set_range(torch.full((4,), -2.0), torch.full((4,), 2.0))
+    before = torch.random.get_rng_state()
+    fresh, again, other = (quality.untrained(trained, seed) for seed in (3, 3, 4))
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert torch.equal(fresh.action_scaling.scale, trained.action_scaling.scale)
+    weights = [model.rssm.prior_hidden.weight for model in (trained, fresh, again, other)]
+    assert torch.equal(weights[1], weights[2])
+    assert not torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[1], weights[3])
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"quality\.json is missing: expected the quality\.json of"):
+        quality_section(tmp_path / "quality.json")

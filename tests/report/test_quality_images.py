@@ -1,0 +1,152 @@
+"""Image error of predictions, against values worked out by hand and against the open-loop section of the report."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot_wm.report.open_loop import WINDOW, load_world_model, predict
+from lerobot_wm.report.quality_episodes import (
+    Episode,
+    choose_episodes,
+    filter_episodes,
+    read_episodes,
+    start_positions,
+)
+from lerobot_wm.report.quality_open_loop import (
+    PREDICTIONS,
+    image_errors,
+    mean_and_median_image,
+    predictions,
+    summarise,
+)
+from tests.report.quality_model import lively_world_model
+
+
+@pytest.fixture(scope="module")
+def episodes(demos_root: Path) -> list[Episode]:
+    chosen = read_episodes("test/demos", str(demos_root), OBS_IMAGE, per_task=3, seed=0)
+    return [episode for episode in chosen if len(episode.actions) >= WINDOW]
+
+
+def test_errors_of_constructed_images() -> None:
+    truth = torch.zeros(1, 5, 3, 16, 16)
+    truth[..., :4, :4] = 1  # the foreground: 16 of 256 pixels
+    half, background_off = truth / 2, truth.clone()
+    background_off[..., 4:, :] = 0.1
+    images = {"truth": truth, "open loop": half, "shuffled actions": background_off}
+    images |= {name: torch.zeros_like(truth) for name in ("copy last frame", "mean image")}
+    images["closed loop"] = truth
+    rows = summarise(image_errors(images, ["a task"], median_image=torch.zeros(3, 16, 16)))
+    table = pd.DataFrame(rows).query("task == 'a task' and horizon == 5").set_index("prediction")
+
+    assert list(table.index) == list(PREDICTIONS)
+    assert table["foreground_share"].tolist() == [1 / 16] * 5
+    assert table["foreground_psnr"].tolist() == pytest.approx([6.0206, 100, 0, 0, 100], abs=1e-3)
+    # Squared errors 0.25/16, 0.01·192/256, 1/16, 1/16 and none.
+    assert table["psnr"].tolist() == pytest.approx([18.0618, 21.2494, 12.0412, 12.0412, 100], abs=1e-3)
+    assert table["ssim"]["closed loop"] == pytest.approx(1)
+    assert table["ssim"]["copy last frame"] < table["ssim"]["open loop"] < 1
+    overall = pd.DataFrame(rows).query("task == 'all tasks' and horizon == 5")
+    assert overall["psnr"].tolist() == table["psnr"].tolist()
+
+
+def test_an_image_without_foreground_has_no_foreground_psnr() -> None:
+    images = dict.fromkeys(("truth", *PREDICTIONS), torch.zeros(1, 5, 3, 16, 16))
+    rows = summarise(image_errors(images, ["a task"], median_image=torch.zeros(3, 16, 16)))
+    assert {row["foreground_psnr"] for row in rows} == {None}
+
+
+def test_what_passes_by_is_in_the_mean_but_not_in_the_median_image(episodes: list[Episode]) -> None:
+    frames = torch.full((50, 64, 64, 3), 100, dtype=torch.uint8)
+    frames[:20, :8] = 200  # there for 2 of the 5 frames taken
+    mean, median = mean_and_median_image([replace(episodes[0], frames=frames)])
+    torch.testing.assert_close(median, torch.full((3, 64, 64), 100 / 255))
+    assert mean[0, 0, 0].item() == pytest.approx(140 / 255)
+
+
+def test_open_loop_is_that_of_the_report(world_model_path: Path, episodes: list[Episode]) -> None:
+    policy = load_world_model(str(world_model_path))
+    policy.world_model = lively_world_model(world_model_path)
+    one_task = [episode for episode in episodes if episode.task == episodes[-1].task]
+    assert len(one_task) > 1
+    filtered = filter_episodes(policy.world_model, one_task)
+    mean, median = mean_and_median_image(one_task)
+    images = predictions(policy.world_model, one_task, filtered, mean, seed=0)
+    table = pd.DataFrame(summarise(image_errors(images, [episode.task for episode in one_task], median)))
+    table = table.query("task != 'all tasks'")
+
+    window = slice(WINDOW)
+    expected = predict(
+        policy,
+        one_task[0].task,
+        [
+            {OBS_IMAGE: e.images(window), ACTION: e.actions[window], OBS_STATE: e.proprio[window]}
+            for e in one_task
+        ],
+    )
+    of = {name: table[table["prediction"] == name]["psnr"].tolist() for name in PREDICTIONS}
+    assert of["open loop"] == pytest.approx(expected.psnr, abs=1e-3)
+    assert of["copy last frame"] == pytest.approx(expected.copy_psnr, abs=1e-3)
+    with torch.no_grad():
+        whole = policy.world_model.filter(one_task[0].images(window)[None], one_task[0].actions[None, window])
+        torch.testing.assert_close(
+            images["closed loop"][0, -1], policy.world_model.decode(whole.last().latent)[0]
+        )
+
+
+def test_shuffled_actions_are_another_episodes(world_model_path: Path, episodes: list[Episode]) -> None:
+    world_model = lively_world_model(world_model_path)
+    two = [episodes[0], episodes[-1]]
+    filtered = filter_episodes(world_model, two)
+    mean, _ = mean_and_median_image(two)
+    swapped = [replace(two[0], actions=two[1].actions), replace(two[1], actions=two[0].actions)]
+    images = predictions(world_model, two, filtered, mean, seed=0)
+    shuffled = images["shuffled actions"]
+    assert (shuffled - images["open loop"]).abs().max() > 0.01
+    torch.testing.assert_close(
+        shuffled, predictions(world_model, swapped, filtered, mean, seed=0)["open loop"]
+    )
+
+
+@torch.no_grad()
+def test_filtering_in_batches_is_filtering_one_by_one(
+    world_model_path: Path, episodes: list[Episode]
+) -> None:
+    world_model = lively_world_model(world_model_path)
+    assert len({len(episode.actions) for episode in episodes}) > 1, "or nothing is padded"
+    for episode, loop in zip(episodes, filter_episodes(world_model, episodes), strict=True):
+        states = world_model.filter(episode.images(slice(None))[None], episode.actions[None])
+        torch.testing.assert_close(loop.latents, states.latent[0], atol=1e-5, rtol=1e-4)
+        assert loop.kl.shape == episode.success.shape
+        assert bool((loop.kl > 0).all())
+
+
+def test_episodes_are_spread_over_variations() -> None:
+    table = pd.DataFrame(
+        [(task, variation) for task in (0, 1) for variation in range(5) for _ in range(4)],
+        columns=["task_index", "variation"],
+    ).rename_axis("episode_index")
+    table = table.reset_index()
+    chosen = choose_episodes(table, per_task=7, seed=0)
+    counts = table.set_index("episode_index").loc[chosen].value_counts().sort_index()
+    assert counts.groupby("task_index").sum().tolist() == [7, 7]
+    assert set(counts) == {1, 2}, "each of the 5 variations once, and two of them twice"
+    assert chosen == choose_episodes(table, per_task=7, seed=0)
+    assert chosen != choose_episodes(table, per_task=7, seed=1)
+
+
+def test_positions_tell_variations_apart(demos_root: Path) -> None:
+    episodes = read_episodes("test/demos", str(demos_root), OBS_IMAGE, per_task=4, seed=0)
+    names = {(episode.task, episode.variation) for episode in episodes}
+    assert len(set(start_positions(episodes))) == len(names)
+
+
+def test_a_dataset_without_positions_is_refused(episodes_root: Path) -> None:
+    with pytest.raises(
+        ValueError, match=r"test/episodes has no .*observation\.environment_state.*lerobot-wm collect"
+    ):
+        read_episodes("test/episodes", str(episodes_root), OBS_IMAGE, per_task=1, seed=0)

@@ -1,0 +1,134 @@
+"""Probes recover what is there, fail where nothing is, and never see a variation they are tested on."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lerobot_wm.constants import OBS_IMAGE
+from lerobot_wm.report.open_loop import load_world_model
+from lerobot_wm.report.quality_episodes import filter_episodes, read_episodes
+from lerobot_wm.report.quality_probes import (
+    BLIND,
+    EMBEDDING,
+    FRAMES_PER_EPISODE,
+    LATENT,
+    MEAN_OF_TASKS,
+    PIXELS,
+    TARGETS,
+    UNTRAINED,
+    Frames,
+    draw_frames,
+    probe_positions,
+    probe_task,
+    splits,
+)
+
+VARIATIONS, PER_VARIATION = 10, 15
+
+
+@pytest.fixture(scope="module")
+def frames() -> Frames:
+    """Two tasks whose latent holds the positions linearly, in its smaller directions; the rest holds other things."""
+    rng = np.random.default_rng(0)
+    n = 2 * VARIATIONS * PER_VARIATION
+    tasks = np.repeat(["first", "second"], n // 2)
+    variations = np.tile(np.repeat(np.arange(VARIATIONS), PER_VARIATION), 2)
+    env_state = rng.normal(0, 0.1, (n, 39))
+    goals = rng.normal(0, 0.1, (2 * VARIATIONS, 3))
+    env_state[:, TARGETS["goal"]] = goals[variations + VARIATIONS * (tasks == "second")]
+    position = np.hstack([env_state[:, columns] for columns in TARGETS.values()])  # (N, 9)
+    is_second = 10.0 * (tasks == "second")[:, None]
+    mixture, _ = np.linalg.qr(rng.normal(size=(30, 30)))
+    features = {
+        LATENT: np.hstack([position, is_second, rng.normal(0, 3, (n, 20))]) @ mixture,
+        EMBEDDING: np.eye(VARIATIONS)[variations],
+        UNTRAINED: rng.normal(size=(n, 30)),
+        PIXELS: np.hstack(
+            [position, rng.normal(0, 1e-3, (n, 200))]
+        ),  # as components: large ones and small ones
+        BLIND: np.zeros((n, 1)),
+    }
+    return Frames(features, env_state, tasks, variations, to_fit=None)
+
+
+@pytest.fixture(scope="module")
+def table(frames: Frames) -> pd.DataFrame:
+    return positions(frames)
+
+
+def positions(frames: Frames) -> pd.DataFrame:
+    return pd.DataFrame(probe_positions(frames)).set_index(["task", "target", "representation"]).sort_index()
+
+
+def test_a_linear_target_is_recovered_and_noise_is_not(table: pd.DataFrame) -> None:
+    # A grid of penalties that began at 10 made latents look half as precise as they are.
+    for target in TARGETS:
+        found, nothing = table.loc[("first", target, LATENT)], table.loc[("first", target, UNTRAINED)]
+        blind = table.loc[("first", target, BLIND)]
+        assert found["r2"] > 0.95
+        assert found["median_cm"] < 0.3 * blind["median_cm"]
+        assert nothing["r2"] < 0.1
+        assert nothing["mean_cm"] > 0.9 * blind["mean_cm"]
+    tasks = table.xs("goal", level="target")["mean_cm"].unstack("task")
+    np.testing.assert_allclose(tasks[MEAN_OF_TASKS], (tasks["first"] + tasks["second"]) / 2)
+
+
+def test_small_components_do_not_drown_large_ones(table: pd.DataFrame) -> None:
+    # Standardised like the other representations, 200 components of noise hid the 9 that matter.
+    assert table.loc[("first", "gripper", PIXELS)]["r2"] > 0.95
+
+
+def test_knowing_the_variation_by_heart_does_not_help(table: pd.DataFrame) -> None:
+    # Split by frame, the goal of each variation would be read off exactly.
+    assert table.loc[("first", "goal", EMBEDDING)]["r2"] < 0
+
+
+def test_the_blind_probe_is_the_mean_of_what_it_was_fitted_on(frames: Frames) -> None:
+    fitted = Frames(frames.features, frames.env_state, frames.tasks, frames.variations, frames.variations < 5)
+    of_task = frames.tasks == "second"
+    goal = frames.env_state[:, TARGETS["goal"]]
+    mean = goal[of_task & (frames.variations < 5)].mean(axis=0)
+    error = 100 * np.linalg.norm(goal[of_task & (frames.variations >= 5)] - mean, axis=1)
+    row = positions(fitted).loc[("second", "goal", BLIND)]
+    assert row["median_cm"] == pytest.approx(np.median(error))
+    assert row["mean_cm"] == pytest.approx(error.mean())
+
+
+def test_splits_share_no_variation(frames: Frames) -> None:
+    rows = np.flatnonzero(frames.tasks == "second")
+    parts = splits(frames, rows)
+    assert len(parts) == 5
+    for fit, test in parts:
+        assert not set(frames.variations[fit]) & set(frames.variations[test])
+        assert set(frames.tasks[fit]) == {"second"}
+    assert sorted(np.concatenate([test for _, test in parts])) == rows.tolist(), "each frame is tested once"
+
+
+def test_too_few_variations_are_refused(frames: Frames) -> None:
+    rows = np.flatnonzero(frames.variations < 2)
+    with pytest.raises(ValueError, match=r"'first' have 2 variation\(s\).*need 3"):
+        splits(frames, rows)
+
+
+def test_the_task_is_told_from_what_holds_it(frames: Frames) -> None:
+    accuracy = {row["representation"]: row["accuracy"] for row in probe_task(frames)}
+    assert accuracy[LATENT] > 0.99
+    assert accuracy[BLIND] == 0.5
+    assert accuracy[UNTRAINED] < 0.65
+
+
+def test_frames_of_real_episodes(demos_root: Path, world_model_path: Path) -> None:
+    world_model = load_world_model(str(world_model_path)).world_model
+    episodes = read_episodes("test/demos", str(demos_root), OBS_IMAGE, per_task=2, seed=0)
+    filtered = filter_episodes(world_model, episodes)
+    frames = draw_frames(episodes, filtered, filtered, n_fit=2, seed=0)
+    assert frames.to_fit.tolist() == [i < 2 for i in range(4) for _ in range(FRAMES_PER_EPISODE)]
+    rows = {tuple(row) for row in frames.env_state[:FRAMES_PER_EPISODE].tolist()}
+    assert rows <= {tuple(row) for row in episodes[0].env_state.numpy().astype(np.float64).tolist()}
+    assert frames.features[PIXELS].shape == frames.features[LATENT].shape
+    # Components keep their proportions: scaled to equal variance, the least of them would drown the first.
+    variances = frames.features[PIXELS][frames.to_fit].var(axis=0, ddof=1)
+    assert variances.mean() == pytest.approx(1, rel=1e-3)
+    assert variances[0] > 10 * variances[-1]

@@ -1,0 +1,121 @@
+"""The tables by arm: order, contents, the paper's numbers, and what their notes say."""
+
+from collections.abc import Callable
+
+import pytest
+
+from lerobot_wm.constants import MT6
+from lerobot_wm.report.arms import ARMS, by_arm
+from lerobot_wm.report.bootstrap import Estimate
+from lerobot_wm.report.paper_table import PAPER_TABLE
+from lerobot_wm.report.statistics import SuccessRate
+from lerobot_wm.report.success import (
+    comparison_tables,
+    overall_table,
+    paper_comparison,
+    seed_table,
+    task_table,
+)
+
+TASKS = {"button-press-topdown-v3": (10, 39), "reach-v3": (4, 15)}
+SIX = dict.fromkeys(MT6, (9, 30))
+
+
+def test_arms_down_in_a_fixed_order_tasks_across(make_records: Callable) -> None:
+    records = [r for arm in ("mine", "proprio_bc", "wm_bc", "e2e_bc") for r in make_records(arm, TASKS)]
+    table = task_table("Success per task", records + make_records("wm_iql", {"reach-v3": (5, 20)}))
+    assert table.columns == list(TASKS)
+    assert [arm for arm, _ in table.rows] == ["e2e_bc", "wm_iql", "wm_bc", "proprio_bc", "mine"]
+    assert dict(table.rows)["wm_iql"] == [None, SuccessRate(25, 50)]
+    assert dict(table.rows)["wm_bc"] == [SuccessRate(49, 50), SuccessRate(19, 50)]
+
+
+def test_unknown_arms_keep_their_order(make_records: Callable) -> None:
+    arms = [f"mine {i}" for i in range(9)]
+    assert list(by_arm(r for arm in arms for r in make_records(arm, TASKS))) == arms
+
+
+def test_seeds_are_pooled_and_counted(make_records: Callable) -> None:
+    records = make_records("wm_bc", TASKS, seed=0) + make_records("wm_bc", {"reach-v3": (5, 20)}, seed=1)
+    assert dict(task_table("", records).rows)["wm_bc"][1] == SuccessRate(44, 100)
+    table = overall_table(records)
+    assert table.columns == ["seeds", "seen", "unseen", "all", "mean", "IQM"]
+    seeds, seen, unseen, together, mean, iqm = dict(table.rows)["wm_bc"]
+    assert (seeds, seen, unseen) == (2, SuccessRate(19, 30), SuccessRate(74, 120))
+    assert together == SuccessRate(93, 150)
+    assert isinstance(mean, Estimate)
+    assert mean.percent == pytest.approx(100 * (0.98 + 0.38 + 0.5) / 3)
+    assert iqm.percent == pytest.approx(mean.percent), "a quarter of three scores is none"
+
+    by_seed = seed_table(records)
+    assert dict(by_seed.rows) == {
+        "wm_bc, seed 0": [SuccessRate(49, 50), SuccessRate(19, 50), SuccessRate(68, 100)],
+        "wm_bc, seed 1": [None, SuccessRate(25, 50), SuccessRate(25, 50)],
+    }
+
+
+def test_environments_without_variations_have_no_splits(make_records: Callable) -> None:
+    records = [record | {"seen": None} for record in make_records("act", TASKS)]
+    assert overall_table(records).columns == ["seeds", "all", "mean", "IQM"]
+
+
+def test_notes_say_what_was_resampled_and_trained_on(make_records: Callable) -> None:
+    def notes(*arms: str, seeds: int = 1) -> str:
+        return "\n".join(
+            overall_table([r for a in arms for s in range(seeds) for r in make_records(a, TASKS, s)]).notes
+        )
+
+    assert "One seed (wm_bc): the variations of the one run are resampled" in notes("wm_bc")
+    assert "Several seeds" not in notes("wm_bc")
+    assert "One seed" not in notes("wm_bc", seeds=2)
+    assert "nearly BC" not in notes("wm_bc")
+    assert "each weight lies in [0.61, 1.65]: IQL is nearly BC" in notes("wm_iql")
+    assert "Trained on dense reward: e2e_iql_dense." in notes("e2e_iql", "e2e_iql_dense")
+    assert "dense" not in notes("e2e_iql")
+
+
+def test_the_papers_numbers() -> None:
+    # What Table 1 prints last; Individual BC is the one row that its own cells do not give.
+    for arm, paper in PAPER_TABLE.items():
+        mean = paper.all_tasks().successes / paper.all_tasks().n
+        assert mean == pytest.approx(0.57 if arm == "e2e_bc_single" else paper.overall, abs=1e-4)
+        assert [cell.successes / cell.n for cell in paper.cells()] == pytest.approx(paper.rates)
+    assert PAPER_TABLE.keys() <= ARMS.keys()
+    assert [round(b) for b in PAPER_TABLE["wm_iql"].all_tasks().interval] == [59, 70]
+
+
+def test_ours_beside_the_papers(make_records: Callable) -> None:
+    records = make_records("wm_bc", SIX) + make_records("e2e_iql_dense", SIX) + make_records("state_bc", SIX)
+    table = paper_comparison(records)
+    labels = [label for label, _ in table.rows]
+    assert labels[:4] == ["e2e_iql", "e2e_iql_dense", "  paper's e2e_iql", "e2e_bc"]
+    assert labels[-2:] == ["wm_bc", "  paper's wm_bc"]
+    assert "state_bc" not in labels
+    rows = dict(table.rows)
+    assert rows["wm_bc"] == [SuccessRate(39, 50)] * 6 + [SuccessRate(234, 300), None]
+    assert rows["  paper's wm_bc"][3] == SuccessRate(10, 50), "reach"
+    assert rows["  paper's wm_bc"][-2:] == [SuccessRate(197, 300), "0.6567"]
+    assert rows["e2e_iql"] == [None] * 8, "not run: said so"
+
+
+def test_the_paper_is_not_put_beside_other_tasks(make_records: Callable) -> None:
+    assert paper_comparison(make_records("wm_bc", TASKS)) is None
+    assert paper_comparison(make_records("wm_bc", SIX | {"push-v3": (0, 0)})) is None
+
+
+def test_comparison_in_words(make_records: Callable) -> None:
+    records = make_records("wm_bc", {"reach-v3": (10, 8)}) + make_records("proprio_bc", {"reach-v3": (5, 5)})
+    [table] = comparison_tables(records)
+    assert table.title == "wm_bc against each other arm"
+    [(other, cells)] = table.rows
+    assert other == "proprio_bc"
+    assert cells[0].startswith("+16.0 [+")
+    assert cells[1:] == ["8–0", "0.008", 50, "better (interval excludes zero)"]
+    assert comparison_tables(make_records("proprio_bc", TASKS)) == []
+
+
+def test_comparisons_over_seeds_have_no_p(make_records: Callable) -> None:
+    records = [r for arm in ("wm_iql", "wm_bc") for seed in (0, 1) for r in make_records(arm, TASKS, seed)]
+    tables = comparison_tables(records)
+    assert [table.rows[0][1][2] for table in tables] == ["–", "–"]
+    assert [len(table.notes) for table in tables] == [0, 1], "explained once"

@@ -1,0 +1,128 @@
+"""From stages to records: finished arms are recorded once, failed ones are named, committed ones are not run."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from lerobot_wm.experiment.arms import ARMS, Arm
+from lerobot_wm.experiment.experiment import Experiment
+from lerobot_wm.experiment.lock import exclusive
+from lerobot_wm.experiment.plan import Plan
+from lerobot_wm.experiment.preset import load_preset
+from lerobot_wm.experiment.reproduce import main, show_failures
+from lerobot_wm.experiment.stage import Stage
+from lerobot_wm.report.records import read_records
+
+# Writes the two rollouts of an arm: python -c ROLL_OUT FOLDER ARM SEED
+ROLL_OUT = """
+import json, pathlib, sys
+folder, arm, seed = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+assert arm != "wm_iql", "no such luck"
+folder.mkdir(parents=True)
+record = {"arm": arm, "policy_type": "wm_bc", "preset": "smoke", "seed": seed, "task": "reach-v3", "seen": True,
+          "success": True, "steps": 1, "return": 1.0}
+lines = [json.dumps({**record, "variation": k}) for k in (0, 1)]
+(folder / "records.jsonl").write_text("\\n".join(lines) + "\\n")
+(folder / "done").touch()
+"""
+
+
+class QuickPlan(Plan):
+    """Arms whose rollouts take no training."""
+
+    def evaluations(self, arm: Arm, seed: int) -> list[Stage]:
+        folder = self.output_dir / f"{arm.name}_{seed}"
+        argv = (sys.executable, "-c", ROLL_OUT, str(folder), arm.name, str(seed))
+        return [Stage(folder.name, "evaluate", argv, folder, folder / "done")]
+
+
+def experiment(folder: Path, arms: list[tuple[str, int]]) -> Experiment:
+    plan = QuickPlan(replace(load_preset("smoke"), tasks="reach-v3"), folder / "outputs")
+    runs = [(ARMS[name], seed) for name, seed in arms]
+    return Experiment(plan, runs, folder / "results", processes=2, quality=False)
+
+
+def run(folder: Path, arms: list[tuple[str, int]]) -> tuple[list[Stage], str]:
+    """Run these arms; returns what failed and what was printed."""
+    with (folder / "printed").open("w+") as file:
+        console = Console(file=file, width=200)
+        with exclusive(folder / "outputs") as lock:
+            failed = experiment(folder, arms).run(lock, console)
+        show_failures(failed, console)
+        file.seek(0)
+        return failed, file.read()
+
+
+def recorded(folder: Path) -> list[tuple[str, int | None]]:
+    records = read_records([folder / "outputs" / "records.jsonl"])
+    return sorted({(record["arm"], record["seed"]) for record in records})
+
+
+def test_a_failed_arm_is_named_with_its_log_and_stops_no_other(tmp_path: Path) -> None:
+    failed, printed = run(tmp_path, [("wm_iql", 0), ("wm_bc", 0), ("wm_bc", 1)])
+    assert [stage.name for stage in failed] == ["wm_iql_0"]
+    assert "AssertionError: no such luck" in printed
+    assert recorded(tmp_path) == [("wm_bc", 0), ("wm_bc", 1)]
+
+
+def test_finished_arms_are_not_run_again_and_new_ones_are_added(tmp_path: Path) -> None:
+    run(tmp_path, [("wm_bc", 0)])
+    assert "wm_bc_0" not in run(tmp_path, [("wm_bc", 0), ("state_bc", 0)])[1]
+    assert recorded(tmp_path) == [("state_bc", 0), ("wm_bc", 0)]
+
+
+def test_rollouts_that_a_killed_run_left_behind_are_recorded(tmp_path: Path) -> None:
+    run(tmp_path, [("wm_bc", 0)])
+    (tmp_path / "outputs" / "records.jsonl").unlink()
+    _, printed = run(tmp_path, [("wm_bc", 0)])
+    assert printed == ""
+    assert recorded(tmp_path) == [("wm_bc", 0)]
+
+
+@pytest.fixture
+def committed(tmp_path: Path) -> Path:
+    """A folder where wm_bc's records are committed and everything else of it is gone."""
+    run(tmp_path, [("wm_bc", 0)])
+    (tmp_path / "results").mkdir()
+    (tmp_path / "outputs" / "records.jsonl").rename(tmp_path / "results" / "records.jsonl")
+    (tmp_path / "outputs" / "wm_bc_0" / "done").unlink()
+    return tmp_path
+
+
+def test_committed_records_count_as_done(committed: Path) -> None:
+    assert run(committed, [("wm_bc", 0)])[1] == ""
+    assert not (committed / "outputs" / "wm_bc_0" / "done").exists()
+    times = json.loads((committed / "outputs" / "times.json").read_text())
+    assert list(times) == ["wm_bc_0"]
+
+
+def test_list_says_what_is_done_and_what_is_left(committed: Path) -> None:
+    with (committed / "printed").open("w+") as file:
+        experiment(committed, [("wm_bc", 0), ("wm_bc", 1)]).show(Console(file=file, width=80))
+        file.seek(0)
+        lines = [" ".join(line.split()) for line in file.read().splitlines()]
+    assert "wm_bc, seed 0 records complete" in lines
+    assert any(line.startswith("wm_bc_1 to run") for line in lines)
+    assert lines[-1].startswith("Stages to run: 1, about")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--preset=huge", "No preset 'huge'.*there are cpu"),
+        ("--preset=smoke --arms=wm_cb", "No arm 'wm_cb'"),
+        ("--preset=smoke --processes=0", "expected at least 1"),
+    ],
+)
+def test_bad_flags_are_refused_before_work_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, message: str
+) -> None:
+    output_dir = tmp_path / "outputs"
+    monkeypatch.setattr(sys, "argv", ["reproduce_table1.py", f"--output_dir={output_dir}", *flags.split()])
+    with pytest.raises(SystemExit, match=message):
+        main()
+    assert not output_dir.exists()

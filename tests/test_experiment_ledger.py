@@ -1,0 +1,90 @@
+"""Records of the experiment: what counts as finished, and that no rollout is ever there twice."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lerobot_wm.experiment.ledger import Ledger
+from lerobot_wm.experiment.preset import Preset, load_preset
+from lerobot_wm.report.records import Record, read_records, record_line
+
+
+@pytest.fixture
+def preset() -> Preset:
+    return replace(
+        load_preset("smoke"), tasks="reach-v3,door-open-v3", first_eval_seed=48, rollouts_per_task=3
+    )
+
+
+def rollouts(arm: str, seed: int, preset: Preset, success: bool = True) -> list[Record]:
+    """One on each of the variations 48, 49 and, a seed further, 0."""
+    return [
+        {
+            "arm": arm,
+            "policy_type": "wm_bc",
+            "preset": preset.name,
+            "seed": seed,
+            "task": task,
+            "variation": variation,
+            "seen": variation < 10,
+            "success": success,
+            "steps": 5,
+            "return": float(success),
+        }
+        for task in preset.task_names
+        for variation in (48, 49, 0)
+    ]
+
+
+def write(path: Path, records: list[Record]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(map(record_line, records)))
+    return path
+
+
+def test_added_once_and_found_again(tmp_path: Path, preset: Preset) -> None:
+    path, committed = tmp_path / "records.jsonl", tmp_path / "none.jsonl"
+    ledger = Ledger(path, committed, preset)
+    assert ledger.empty
+    records = rollouts("wm_bc", 0, preset)
+    # As an individual arm leaves them: a file per task.
+    files = [write(tmp_path / "a.jsonl", records[:3]), write(tmp_path / "b.jsonl", records[3:])]
+    for _ in range(2):
+        ledger.add("wm_bc", 0, files)
+    assert read_records([path]) == records
+    again = Ledger(path, committed, preset)
+    assert ("wm_bc", 0) in again
+    assert ("wm_bc", 1) not in again
+    again.add("wm_bc", 1, [write(tmp_path / "c.jsonl", rollouts("wm_bc", 1, preset))])
+    assert len(read_records([path])) == 2 * len(records)  # read_records refuses a rollout that is there twice
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_committed_records_count_and_win(tmp_path: Path, preset: Preset) -> None:
+    path = write(tmp_path / "records.jsonl", rollouts("wm_bc", 0, preset) + rollouts("wm_iql", 0, preset))
+    committed = write(tmp_path / "results.jsonl", rollouts("wm_bc", 0, preset, success=False))
+    ledger = Ledger(path, committed, preset)
+    assert ("wm_bc", 0) in ledger
+    assert ("wm_iql", 0) in ledger
+    ledger.write()
+    kept = read_records([path])
+    assert len(kept) == 12
+    assert not any(record["success"] for record in kept if record["arm"] == "wm_bc")
+
+
+def test_an_incomplete_run_does_not_count(tmp_path: Path, preset: Preset) -> None:
+    committed = write(tmp_path / "results.jsonl", rollouts("wm_bc", 0, preset)[:-1])
+    ledger = Ledger(tmp_path / "records.jsonl", committed, preset)
+    assert ("wm_bc", 0) not in ledger
+    ledger.add("wm_bc", 0, [write(tmp_path / "a.jsonl", rollouts("wm_bc", 0, preset))])
+    assert len(read_records([tmp_path / "records.jsonl"])) == 6
+
+
+@pytest.mark.parametrize("wrong", ["seed", "number"])
+def test_other_rollouts_than_expected_are_refused(tmp_path: Path, preset: Preset, wrong: str) -> None:
+    ledger = Ledger(tmp_path / "records.jsonl", tmp_path / "none.jsonl", preset)
+    records = rollouts("wm_bc", 1, preset) if wrong == "seed" else rollouts("wm_bc", 0, preset)[1:]
+    with pytest.raises(ValueError, match=r"expected the 6 of \('wm_bc', 0\)"):
+        ledger.add("wm_bc", 0, [write(tmp_path / "a.jsonl", records)])
+    assert ledger.empty

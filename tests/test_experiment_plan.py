@@ -1,0 +1,205 @@
+"""Presets and arms as stages: what needs what, and that every command line is understood by its command."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import draccus
+import pytest
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_wm.constants import MT6
+from lerobot_wm.experiment.arms import ARMS, Arm
+from lerobot_wm.experiment.plan import Plan
+from lerobot_wm.experiment.preset import load_preset, select_runs
+from lerobot_wm.experiment.report import report_command
+from lerobot_wm.experiment.stage import Stage, in_order, unfinished
+from lerobot_wm.pipeline.collect import CollectConfig
+from lerobot_wm.pipeline.encode import EncodeConfig
+from lerobot_wm.pipeline.eval_config import EvaluateConfig
+from lerobot_wm.pipeline.expert import ExpertConfig
+from lerobot_wm.pipeline.init import InitConfig
+from lerobot_wm.pipeline.relabel import RelabelConfig
+from lerobot_wm.report.build import ReportConfig
+from lerobot_wm.report.quality import QualityConfig
+
+CONFIGS: dict[str, Any] = {
+    "collect": CollectConfig,
+    "encode": EncodeConfig,
+    "eval": EvaluateConfig,
+    "expert": ExpertConfig,
+    "init": InitConfig,
+    "quality": QualityConfig,
+    "relabel": RelabelConfig,
+    "report": ReportConfig,
+    "train": TrainPipelineConfig,
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _types() -> None:
+    register_third_party_plugins()
+
+
+def plan(folder: Path, preset: str = "cpu", **fields: Any) -> Plan:
+    return Plan(load_preset(preset), folder, **fields)
+
+
+def finish(stage: Stage) -> None:
+    stage.artefact.parent.mkdir(parents=True)
+    stage.artefact.write_text("")
+
+
+def stages_of(folder: Path, *arms: str, preset: str = "cpu") -> dict[str, Stage]:
+    at = plan(folder, preset)
+    return in_order(
+        stage for arm, seed in select_runs(at.preset, list(arms), [0]) for stage in at.evaluations(arm, seed)
+    )
+
+
+def parse(argv: tuple[str, ...]) -> Any:
+    """Read a command line as its command does."""
+    assert argv[:3] == (sys.executable, "-m", "lerobot_wm.cli")
+    command, *flags = argv[3:]
+    # LeRobot reads the checkpoint's own configuration for these two kinds of flags.
+    flags = [flag for flag in flags if command != "eval" or not flag.startswith("--policy.")]
+    return draccus.parse(CONFIGS[command], args=flags)
+
+
+def shape(stage: Stage) -> tuple[str, ...]:
+    """What decides whether a command line parses: the flags, and the values that name a type or a file of settings."""
+    named = ("--config_path=", "--policy.type=")
+    return tuple(flag if flag.startswith(named) else flag.partition("=")[0] for flag in stage.argv)
+
+
+def test_every_command_line_is_understood(tmp_path: Path) -> None:
+    at = plan(tmp_path, "smoke", variation_set=43)
+    runs = select_runs(at.preset, list(ARMS), [0])
+    stages = in_order([*(stage for run in runs for stage in at.evaluations(*run)), at.quality(0)])
+    # One command line of each shape: LeRobot takes half a second to read one.
+    distinct = {shape(stage): name for name, stage in reversed(stages.items())}
+    parsed = {name: parse(stages[name].argv) for name in distinct.values()}
+    assert {stages[name].argv[3] for name in parsed} == set(CONFIGS) - {"report"}
+
+    assert parsed["seed_0/wm_iql"].policy.sweep_betas == [0, 3, 10]
+    assert parsed["seed_0/wm_rssm_proprio"].policy.rssm.use_proprio
+    assert parsed["seed_0/state_bc"].policy.use_environment_state
+    assert not parsed["seed_0/proprio_bc"].policy.use_latent
+    button = parsed[f"seed_0/wm_bc_single_{MT6[0]}"]
+    assert button.dataset.episodes == [0, 1]
+    assert button.dataset.root == str(tmp_path / "seed_0" / "latents_wm_rssm")
+    assert button.policy.world_model_path.endswith("seed_0/wm_rssm/checkpoints/000004/pretrained_model")
+    for stage in stages.values():
+        finish(stage)  # now the report shows everything it can
+    report = parse(report_command(at, runs, tmp_path / "records.jsonl", tmp_path / "report"))
+    assert "eval_expert" not in report.videos  # it has none
+
+
+@pytest.mark.parametrize("name", ["cpu", "paper"])
+def test_presets_differ_from_smoke_in_sizes_only(name: str, tmp_path: Path) -> None:
+    preset, smoke = load_preset(name), load_preset("smoke")
+    stages = stages_of(tmp_path, *ARMS, preset=name)
+    assert {stage.kind for stage in stages.values()} <= set(preset.minutes)
+    assert not any(stage.resumes or stage.finished for stage in stages.values())
+    for arm in ARMS.values():
+        if arm.config is not None:
+            ours, theirs = (json.loads(each.settings(arm.config).read_text()) for each in (preset, smoke))
+            assert ours.keys() == theirs.keys()
+            assert ours["policy"] == theirs["policy"]
+
+
+def test_data_of_each_arm(tmp_path: Path) -> None:
+    stages = stages_of(tmp_path, *ARMS)
+
+    def root(run: str) -> str:
+        [flag] = [flag for flag in stages[f"seed_0/{run}"].argv if flag.startswith("--dataset.root=")]
+        return str(Path(flag.partition("=")[2]).relative_to(tmp_path))
+
+    assert root("wm_rssm") == root("e2e_iql") == root("proprio_bc") == root("state_bc") == "dataset"
+    assert root("e2e_iql_dense") == root(f"e2e_iql_single_dense_{MT6[0]}") == "dataset_dense"
+    assert root("wm_bc") == root("wm_iql") == root(f"wm_bc_single_{MT6[0]}") == "seed_0/latents_wm_rssm"
+    assert root("frozen_bc") == "seed_0/latents_frozen_backbone"
+    door = ",".join(map(str, range(130, 260)))
+    assert f"--dataset.episodes=[{door}]" in stages["seed_0/e2e_bc_single_door-open-v3"].argv
+
+
+def test_individual_arms_have_a_policy_per_task_and_share_the_rest(tmp_path: Path) -> None:
+    stages = stages_of(tmp_path, "wm_bc_single", "wm_bc")
+    assert sum(stage.kind == "wm_bc_single" for stage in stages.values()) == len(MT6)
+    assert [name for name, stage in stages.items() if stage.kind == "encode"] == ["seed_0/latents_wm_rssm"]
+
+
+def test_sweep_arms_roll_out_one_training(tmp_path: Path) -> None:
+    stages = stages_of(tmp_path, "wm_iql", "wm_iql_beta0", "wm_iql_beta3", "wm_iql_beta10")
+    assert [name for name, stage in stages.items() if stage.kind == "wm_iql"] == ["seed_0/wm_iql"]
+    evaluations = [stage for stage in stages.values() if stage.kind == "evaluate"]
+    assert len(evaluations) == 4
+    assert "--policy.beta=3" in stages["seed_0/eval_wm_iql_beta3"].argv
+    assert not [flag for flag in stages["seed_0/eval_wm_iql"].argv if flag.startswith("--policy.beta")]
+
+
+def test_a_finished_policy_needs_no_world_model(tmp_path: Path) -> None:
+    stages = stages_of(tmp_path, "wm_bc")
+    finish(stages["seed_0/wm_bc"])
+    assert list(unfinished([stages["seed_0/eval_wm_bc"]])) == ["seed_0/eval_wm_bc"]
+
+
+def test_a_training_is_finished_by_its_last_step_only(tmp_path: Path) -> None:
+    training = stages_of(tmp_path, "wm_bc")["seed_0/wm_bc"]
+    steps = json.loads(Path("configs/cpu/wm_bc.json").read_text())["steps"]
+    assert str(steps) in str(training.artefact)
+    assert not training.resumes
+    assert training.checkpoint is not None
+    training.checkpoint.parent.mkdir(parents=True)
+    training.checkpoint.write_text("{}")
+    assert training.resumes
+    assert not training.finished
+    assert "--resume=true" in training.command(cores=1)
+
+
+def test_selection_runs_are_kept_apart(tmp_path: Path) -> None:
+    arm, expert = ARMS["wm_bc"], ARMS["expert"]
+    table, selection = plan(tmp_path), plan(tmp_path, variation_set=43)
+    assert table.policies(arm, 0) == selection.policies(arm, 0)
+    for each in (arm, expert):
+        [shown], [chosen] = table.evaluations(each, 0), selection.evaluations(each, 0)
+        assert shown.folder != chosen.folder
+    assert "--env.variation_set=43" in selection.evaluations(arm, 0)[0].argv
+    assert "--variation_set=42" in in_order(selection.evaluations(arm, 0))["dataset"].argv
+
+
+def test_runs_are_chosen_by_arms_and_seeds() -> None:
+    preset = load_preset("cpu")
+
+    def chosen(arms: list[str], seeds: list[int]) -> list[tuple[str, int]]:
+        return [(arm.name, seed) for arm, seed in select_runs(preset, arms, seeds)]
+
+    assert chosen(["wm_bc"], []) == [("wm_bc", 0), ("wm_bc", 1), ("wm_bc", 2)]
+    assert chosen(["expert", "wm_iql"], [4]) == [("wm_iql", 4), ("expert", 0)]
+    assert {name for name, _ in chosen([], [])} == set(preset.arms) == set(ARMS)
+    with pytest.raises(ValueError, match="No arm 'wm_cb'; there are e2e_iql"):
+        select_runs(preset, ["wm_cb"], [])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"noise": None}, "noise"), ({"nose": 1}, "nose"), ({"arms": {"mine": [0]}}, "No arm 'mine'")],
+)
+def test_a_broken_preset_is_refused(tmp_path: Path, change: dict, message: str) -> None:
+    shutil.copytree("configs/smoke", tmp_path / "mine")
+    file = tmp_path / "mine" / "experiment.json"
+    data = {**json.loads(file.read_text()), **change}
+    file.write_text(json.dumps({key: value for key, value in data.items() if value is not None}))
+    with pytest.raises(ValueError, match=message):
+        load_preset("mine", configs=tmp_path)
+
+
+def test_missing_settings_name_their_file(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"there are .*cpu.*paper.*smoke"):
+        load_preset("quick")
+    arm = Arm("mine", config="no_such")
+    with pytest.raises(FileNotFoundError, match=r"configs/cpu/no_such\.json"):
+        plan(tmp_path).evaluations(arm, 0)

@@ -1,0 +1,75 @@
+"""`lerobot-wm relabel`: the same dataset, rewarded by another column."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.pipeline.relabel import relabel
+from tests.flags import DATASET_FLAGS
+
+
+@pytest.fixture(scope="module")
+def dense(
+    demos_root: Path, tmp_path_factory: pytest.TempPathFactory, lerobot_wm_command: Callable[..., None]
+) -> LeRobotDataset:
+    root = tmp_path_factory.mktemp("dense") / "dataset"
+    lerobot_wm_command(
+        "relabel --reward=next.dense_reward --output_repo_id=test/dense",
+        DATASET_FLAGS.format(root=demos_root),
+        f"--output_root={root}",
+    )
+    return LeRobotDataset("test/dense", root=root)
+
+
+def test_nothing_but_the_reward_differs(dense: LeRobotDataset, demos: LeRobotDataset) -> None:
+    assert dense.features == demos.features
+    for index in (0, 100, demos.num_frames - 1):
+        ours, theirs = dense[index], demos[index]
+        assert ours["next.reward"] == theirs["next.dense_reward"]
+        for key in ours.keys() - {"next.reward", "task"}:
+            assert torch.equal(ours[key], theirs[key]), key
+        assert ours["task"] == theirs["task"]
+    assert not torch.equal(
+        torch.stack(list(dense.hf_dataset["next.reward"])), torch.stack(list(demos.hf_dataset["next.reward"]))
+    )
+
+
+def test_statistics_are_those_of_the_new_reward(dense: LeRobotDataset, demos: LeRobotDataset) -> None:
+    """Of the dataset and of each episode: LeRobot merges datasets by the latter."""
+    rewards = torch.stack(list(dense.hf_dataset["next.reward"])).numpy()
+    assert dense.meta.stats["next.reward"]["max"] == pytest.approx(rewards.max())
+    assert dense.meta.stats["next.reward"]["mean"] == pytest.approx(rewards.mean(), rel=1e-4)
+    np.testing.assert_equal(dense.meta.stats["action"], demos.meta.stats["action"])
+    [file] = (Path(dense.root) / "meta" / "episodes").rglob("*.parquet")
+    for _, episode in pd.read_parquet(file).iterrows():
+        rows = slice(episode["dataset_from_index"], episode["dataset_to_index"])
+        assert episode["stats/next.reward/max"] == pytest.approx(rewards[rows].max())
+
+
+def test_it_says_where_the_reward_comes_from(dense: LeRobotDataset, demos_root: Path) -> None:
+    record = json.loads((Path(dense.root) / "meta" / "relabel.json").read_text())
+    assert record["reward"] == "next.dense_reward"
+    assert record["source_fingerprint"] == dataset_fingerprint(demos_root)
+    # how it was collected, too
+    assert (Path(dense.root) / "meta" / "collection.json").read_bytes() == (
+        demos_root / "meta" / "collection.json"
+    ).read_bytes()
+
+
+@pytest.mark.parametrize("reward", ["next.shaped", "next.success", "observation.state"])
+def test_what_is_no_reward_is_refused(reward: str, demos: LeRobotDataset, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"Columns of that kind: next\.reward, next\.dense_reward"):
+        relabel(demos, reward, "test/other", tmp_path / "other")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_is_never_overwritten(demos: LeRobotDataset, tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError, match="another --output_root"):
+        relabel(demos, "next.dense_reward", "test/other", tmp_path)
