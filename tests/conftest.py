@@ -31,7 +31,9 @@ def run_command(*arguments: str) -> None:
         cli.main()
     finally:
         sys.argv = before
-        AcceleratorState._reset_state(True)  # a process trains at one precision, but this one runs many commands
+        AcceleratorState._reset_state(
+            True
+        )  # a process trains at one precision, but this one runs many commands
 
 
 @pytest.fixture(scope="session")
