@@ -2,6 +2,7 @@
 
 # Feature keys, equal to LeRobot's (this module imports nothing, so that nn/, world_model/ and rl/ can use it).
 OBS_IMAGE = "observation.image"
+OBS_IMAGES = "observation.images"
 OBS_STATE = "observation.state"
 OBS_ENV_STATE = "observation.environment_state"
 OBS_LATENT = "observation.latent"
@@ -57,6 +58,6 @@ ENV_STATE_DIM = 39
 IMAGE_SIZE = 64
 ROBOT_TYPE = "metaworld"
 
-# LeRobot's adjusted corner2: it shows every task's objects. Its images arrive flipped on both axes.
+# The default camera, LeRobot's adjusted corner2: it shows every task's objects.
 CAMERA_NAME = "corner2"
 CAMERA_POSITION = (0.75, 0.075, 0.7)

@@ -73,7 +73,7 @@ def test_opens_with_lerobots_names(dataset: LeRobotDataset) -> None:
     assert dataset.num_episodes == len(TASKS) * EPISODES
     assert dataset.fps == 80
     assert dataset.meta.robot_type == "metaworld"
-    for key, feature in metaworld_features(64).items():
+    for key, feature in metaworld_features(64, [OBS_IMAGE]).items():
         found = dataset.meta.features[key]
         assert (found["dtype"], tuple(found["shape"])) == (feature["dtype"], feature["shape"])
     assert list(dataset.meta.tasks.index) == [task_description(task) for task in TASKS]
@@ -170,11 +170,11 @@ def test_complete_dataset_is_left_alone(
         collect(other)
 
 
-def test_dataset_of_before_there_was_a_second_set_is_complete(
+def test_dataset_of_before_there_was_a_choice_is_complete(
     dataset: LeRobotDataset, config: CollectConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     record = json.loads((config.output_root / COLLECTION_RECORD).read_text())
-    del record["config"]["variation_set"]
+    del record["config"]["variation_set"], record["config"]["camera_name"]
     (tmp_path / "meta").mkdir()
     (tmp_path / COLLECTION_RECORD).write_text(json.dumps(record))
     collect(CollectConfig(**{**vars(config), "root": tmp_path}))
@@ -185,6 +185,30 @@ def test_collection_on_the_second_set(tmp_path: Path) -> None:
     one_shard(tmp_path, task="reach-v3", variation_set=43, variations=(7,))
     shard = LeRobotDataset("shards/reach-v3-00000", root=tmp_path / "reach-v3-00000")
     np.testing.assert_allclose(shard[0][OBS_ENV_STATE][36:], rand_vec("reach-v3", 7, 43)[3:], rtol=1e-6)
+
+
+def test_collection_by_two_cameras(
+    dataset: LeRobotDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same episode as by one camera, seen by two; each feature holds its own camera's pictures."""
+    settings = {"repo_id": "user/two", "root": tmp_path / "two", "tasks": "reach-v3", "num_workers": 1}
+    config = CollectConfig(**settings, episodes_per_task=1, camera_name="topview, corner2")
+    two = LeRobotDataset("user/two", root=collect(config))
+    assert two.meta.camera_keys == ["observation.images.topview", "observation.images.corner2"]
+    env = MetaworldMTEnv("reach-v3", camera_name="topview,corner2")
+    pixels = env.reset(seed=0)[0]["pixels"]
+    env.close()
+    for camera, image in pixels.items():
+        seen = two[0][f"observation.images.{camera}"].movedim(0, -1).numpy() * 255
+        assert np.abs(seen - image).mean() < 3.0  # of 255
+    for key in (ACTION, OBS_ENV_STATE):
+        assert torch.equal(two[20][key], dataset[20][key])
+    record = json.loads((tmp_path / "two" / COLLECTION_RECORD).read_text())
+    assert record["config"]["camera_name"] == "topview,corner2"
+    collect(CollectConfig(**settings, episodes_per_task=1, camera_name="topview,corner2"))
+    assert "already complete" in capsys.readouterr().out
+    with pytest.raises(FileExistsError, match=r"camera_name topview,corner2 there, corner2 here"):
+        collect(CollectConfig(**settings, episodes_per_task=1))
 
 
 def test_foreign_folder_is_never_overwritten(tmp_path: Path) -> None:
@@ -205,6 +229,7 @@ def one_shard(folder: Path, **changes: object) -> ShardRecord:
         "max_attempts": 2,
         "seed": 0,
         "image_size": 64,
+        "cameras": ("corner2",),
     }
     shard = Shard(**{**settings, **changes})
     with quiet():
@@ -239,7 +264,9 @@ def test_variations_argument() -> None:
             parse_variations(spec)
 
 
-@pytest.mark.parametrize("change", [{"noise": -0.1}, {"episodes_per_task": 0}, {"tasks": "reach"}])
+@pytest.mark.parametrize(
+    "change", [{"noise": -0.1}, {"episodes_per_task": 0}, {"tasks": "reach"}, {"camera_name": "top"}]
+)
 def test_bad_settings_are_refused_before_work(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"expected|did you mean"):
         CollectConfig(repo_id="user/x", **change)

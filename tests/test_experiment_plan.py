@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,14 @@ def test_selection_runs_are_kept_apart(tmp_path: Path) -> None:
         assert shown.folder != chosen.folder
     assert "--env.variation_set=43" in selection.evaluations(arm, 0)[0].argv
     assert "--variation_set=42" in in_order(selection.evaluations(arm, 0))["dataset"].argv
+
+
+def test_data_and_rollouts_have_the_presets_cameras(tmp_path: Path) -> None:
+    two = replace(load_preset("cpu"), camera_name="corner2,topview")
+    [evaluation] = Plan(two, tmp_path).evaluations(ARMS["wm_bc"], 0)
+    assert "--env.camera_name=corner2,topview" in evaluation.argv
+    assert "--camera_name=corner2,topview" in in_order([evaluation])["dataset"].argv
+    assert load_preset("cpu").camera_name == "corner2"
 
 
 def test_runs_are_chosen_by_arms_and_seeds() -> None:

@@ -4,6 +4,7 @@ Frame t holds the observation o_t, the action a_t executed there, and the reward
 with o_{t+1}.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from lerobot_wm.constants import (
     DONE,
     ENV_STATE_DIM,
     OBS_ENV_STATE,
-    OBS_IMAGE,
     OBS_STATE,
     REWARD,
     STATE_DIM,
@@ -27,15 +27,22 @@ from lerobot_wm.constants import (
 STATE_NAMES = ["x", "y", "z", "gripper"]
 
 
-def metaworld_features(image_size: int) -> dict[str, dict[str, Any]]:
+def metaworld_features(image_size: int, image_keys: Iterable[str]) -> dict[str, dict[str, Any]]:
     """LeRobot's description of each feature: dtype, shape and names.
 
     `next.reward` is the sparse reward, 1 where the step ends in success; `next.dense_reward` is Meta-World's
     shaped one; `next.done` is True from the first success on.
+
+    Args:
+        image_size: Height and width of every camera's images in pixels.
+        image_keys: The cameras' feature keys.
     """
-    image_shape = (image_size, image_size, 3)
+    shape = (image_size, image_size, 3)
     return {
-        OBS_IMAGE: {"dtype": "video", "shape": image_shape, "names": ["height", "width", "channels"]},
+        **{
+            key: {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
+            for key in image_keys
+        },
         OBS_STATE: {"dtype": "float32", "shape": (STATE_DIM,), "names": STATE_NAMES},
         OBS_ENV_STATE: {"dtype": "float32", "shape": (ENV_STATE_DIM,), "names": None},
         ACTION: {"dtype": "float32", "shape": (ACTION_DIM,), "names": STATE_NAMES},

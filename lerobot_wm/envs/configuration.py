@@ -1,6 +1,5 @@
 """LeRobot's view of the environment: `--env.type=metaworld_mt`."""
 
-import difflib
 import logging
 import multiprocessing
 import os
@@ -11,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_wm.constants import (
     ACTION_DIM,
@@ -24,10 +23,9 @@ from lerobot_wm.constants import (
     REPORTED_VARIATION_SET,
     STATE_DIM,
 )
+from lerobot_wm.envs.cameras import image_features, parse_cameras
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import split_variations
-
-CAMERAS = ("corner2", "corner", "corner3", "topview", "behindGripper", "gripperPOV")
 
 
 @EnvConfig.register_subclass(ENV_TYPE)
@@ -41,7 +39,7 @@ class MetaworldMTEnvConfig(EnvConfig):
         variation_set: 42, on which results are reported, or 43, other positions for choosing settings and for probes.
         environment_state: add the full state, `observation.environment_state` (39,), to the observation.
         image_size: height and width of the image in pixels.
-        camera_name: one of the model's cameras.
+        camera_name: one of the model's cameras, or several separated by commas: corner2,topview.
         fast_rendering: leave out shadows, reflections and multisampling.
         episode_length: steps until truncation, at most 500.
         obs_type: "pixels_agent_pos", the only kind.
@@ -63,12 +61,10 @@ class MetaworldMTEnvConfig(EnvConfig):
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,)),
         }
     )
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {"action": ACTION, "agent_pos": OBS_STATE, "pixels": OBS_IMAGE}
-    )
+    features_map: dict[str, str] = field(default_factory=lambda: {"action": ACTION, "agent_pos": OBS_STATE})
 
     def __post_init__(self) -> None:
-        """Check every field and state the image's shape (height, width, channels)."""
+        """Check every field and state the images' shapes (height, width, channels)."""
         resolve_tasks(self.task)
         split_variations(self.split, self.variation_set)
         if self.obs_type != "pixels_agent_pos":
@@ -77,12 +73,12 @@ class MetaworldMTEnvConfig(EnvConfig):
             raise ValueError(f"image_size is {self.image_size}; expected at least 16 pixels.")
         if not 1 <= self.episode_length <= MAX_EPISODE_STEPS:
             raise ValueError(f"episode_length is {self.episode_length}; expected 1 to {MAX_EPISODE_STEPS}.")
-        if self.camera_name not in CAMERAS:
-            close = difflib.get_close_matches(self.camera_name, CAMERAS, n=1)
-            hint = f" (did you mean {close[0]}?)" if close else ""
-            raise ValueError(f"Unknown camera '{self.camera_name}'{hint}; expected {', '.join(CAMERAS)}.")
         shape = (self.image_size, self.image_size, 3)
-        self.features["pixels"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+        keys = image_features(parse_cameras(self.camera_name))
+        for camera, key in keys.items():
+            name = "pixels" if len(keys) == 1 else f"pixels/{camera}"
+            self.features[name] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+            self.features_map[name] = key
         if self.environment_state:
             self.features["environment_state"] = PolicyFeature(type=FeatureType.ENV, shape=(ENV_STATE_DIM,))
             self.features_map["environment_state"] = OBS_ENV_STATE

@@ -15,6 +15,7 @@ from lerobot_wm.constants import (
     REPORTED_VARIATION_SET,
     STATE_DIM,
 )
+from lerobot_wm.envs.cameras import parse_cameras
 from lerobot_wm.envs.rendering import Renderer, RenderKey
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.envs.variations import split_variations
@@ -22,18 +23,19 @@ from lerobot_wm.envs.variations import split_variations
 if TYPE_CHECKING:
     from lerobot_wm.envs.simulation import Simulation
 
-Observation = dict[str, np.ndarray]
+Observation = dict[str, Any]
 
 
 class MetaworldMTEnv(gym.Env):
     """One Meta-World v3 task; `reset(seed=k)` restores fixed variation k of its split, bit for bit.
 
-    Observation: `pixels` uint8 (image_size, image_size, 3) RGB and `agent_pos` float32 (4,): the end
-    effector's position (m) and the gripper's opening (0 to 1); with `environment_state` also
-    `environment_state` float32 (39,), the property of that name. Action: float32 (4,) in [-1, 1], moving the
-    end effector by up to 1 cm per axis, and the gripper's effort. Reward: 1 on a step that ends in success,
-    else 0. `info` holds `is_success`, `variation` and, after a step, `dense_reward` (Meta-World's shaped
-    reward, 0 to 10). The simulator is built at the first reset, so that many environments can be made cheaply.
+    Observation: `pixels` uint8 (image_size, image_size, 3) RGB, with several cameras a dictionary of such
+    images by camera, and `agent_pos` float32 (4,): the end effector's position (m) and the gripper's opening
+    (0 to 1); with `environment_state` also `environment_state` float32 (39,), the property of that name. Action:
+    float32 (4,) in [-1, 1], moving the end effector by up to 1 cm per axis, and the gripper's effort. Reward: 1
+    on a step that ends in success, else 0. `info` holds `is_success`, `variation` and, after a step, `dense_reward`
+    (Meta-World's shaped reward, 0 to 10). The simulator is built at the first reset, so that many environments
+    can be made cheaply.
 
     Args:
         task: a Meta-World v3 task, such as "reach-v3".
@@ -41,7 +43,8 @@ class MetaworldMTEnv(gym.Env):
         variation_set: 42, on which results are reported, or 43, for choosing settings and for probes.
         environment_state: add the full state to the observation, for policies that are given the truth.
         image_size: height and width of the image in pixels.
-        camera_name: one of the model's cameras; "corner2" is moved to where every task is in view.
+        camera_name: one of the model's cameras, or several separated by commas; "corner2" is moved to where
+            every task is in view.
         fast_rendering: leave out shadows, reflections and multisampling.
         episode_length: steps until truncation, at most 500.
     """
@@ -66,9 +69,16 @@ class MetaworldMTEnv(gym.Env):
         self._variations = split_variations(split, variation_set)
         self._variation_set = variation_set
         self._environment_state = environment_state
-        self._render_key = RenderKey(task, camera_name, image_size, fast_rendering)
+        self._render_keys = {
+            camera: RenderKey(task, camera, image_size, fast_rendering)
+            for camera in parse_cameras(camera_name)
+        }
+        image_spaces: dict[str, gym.Space] = {
+            camera: gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
+            for camera in self._render_keys
+        }
         spaces: dict[str, gym.Space] = {
-            "pixels": gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
+            "pixels": gym.spaces.Dict(image_spaces) if len(image_spaces) > 1 else image_spaces.popitem()[1],
             "agent_pos": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
         }
         if environment_state:
@@ -76,12 +86,14 @@ class MetaworldMTEnv(gym.Env):
         self.observation_space = gym.spaces.Dict(spaces)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self._sim: Simulation | None = None
-        self._renderer: Renderer | None = None
+        self._renderers: dict[str, Renderer] = {}
         self._next_index = 0
         self._steps = 0
         self.variation = -1
         self._state = np.zeros(0)
-        self._image = np.zeros((image_size, image_size, 3), np.uint8)
+        self._images = {
+            camera: np.zeros((image_size, image_size, 3), np.uint8) for camera in self._render_keys
+        }
 
     @property
     def environment_state(self) -> np.ndarray:
@@ -129,27 +141,32 @@ class MetaworldMTEnv(gym.Env):
         return self._observe(), float(outcome.success), outcome.success, truncated, info
 
     def render(self) -> np.ndarray:
-        """The current observation's image, uint8 (image_size, image_size, 3)."""
-        return self._image
+        """The current observation's images side by side, uint8 (image_size, cameras x image_size, 3)."""
+        return np.hstack(list(self._images.values()))
 
     def close(self) -> None:
         """Free the simulator and its OpenGL memory; a later reset builds them again."""
         if self._sim is not None:
-            Renderer.release(self._render_key)
-            self._sim = self._renderer = None
+            for key in self._render_keys.values():
+                Renderer.release(key)
+            self._sim = None
 
     def _build(self) -> None:
         from lerobot_wm.envs.simulation import Simulation
 
         self._sim = Simulation(self.task, self._variation_set)
-        self._renderer = Renderer.acquire(self._render_key, self._sim.model)
+        self._renderers = {
+            camera: Renderer.acquire(key, self._sim.model) for camera, key in self._render_keys.items()
+        }
 
     def _observe(self) -> Observation:
         assert self._sim is not None
-        assert self._renderer is not None
-        self._image = self._renderer.render(self._sim.model, self._sim.data)
+        self._images = {
+            camera: renderer.render(self._sim.model, self._sim.data)
+            for camera, renderer in self._renderers.items()
+        }
         observation: Observation = {
-            "pixels": self._image,
+            "pixels": self._images if len(self._images) > 1 else next(iter(self._images.values())),
             "agent_pos": self._state[:STATE_DIM].astype(np.float32),
         }
         if self._environment_state:

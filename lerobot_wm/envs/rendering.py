@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lerobot_wm.constants import CAMERA_NAME
+from lerobot_wm.envs.cameras import UPSIDE_DOWN
 
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco reads it when it is first imported
@@ -32,7 +32,7 @@ class RenderKey(NamedTuple):
     """What environments must have in common to share a renderer: the same meshes, drawn the same way."""
 
     task: str
-    camera_name: str
+    camera: str
     size: int
     fast: bool
 
@@ -43,7 +43,7 @@ _renderers: dict[RenderKey, "Renderer"] = {}
 
 
 class Renderer:
-    """A task's meshes and textures in OpenGL, shared by all sub-environments of that task.
+    """A task's meshes and textures in OpenGL for one camera, shared by all sub-environments of that task.
 
     Get one with `acquire` and give it back with `release`; creating one takes 0.1-0.4 s.
     """
@@ -52,7 +52,7 @@ class Renderer:
         import mujoco
 
         self.users = 0
-        self._upside_down = key.camera_name == CAMERA_NAME
+        self._upside_down = key.camera in UPSIDE_DOWN
         _ensure_gl_context()
         model.vis.global_.offwidth = model.vis.global_.offheight = key.size
         if key.fast:
@@ -65,7 +65,7 @@ class Renderer:
             self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = model.camera(key.camera_name).id
+        self._camera.fixedcamid = model.camera(key.camera).id
         self._options = mujoco.MjvOption()
         self._viewport = mujoco.MjrRect(0, 0, key.size, key.size)
 
@@ -93,8 +93,8 @@ class Renderer:
         mujoco.mjv_updateScene(model, data, self._options, None, self._camera, everything, self._scene)
         mujoco.mjr_render(self._viewport, self._scene, self._context)
         mujoco.mjr_readPixels(image, None, self._viewport, self._context)
-        # OpenGL's rows run upwards: reversing them makes the image upright. corner2 is mounted upside down and
-        # needs both axes reversed on top, which leaves the columns.
+        # OpenGL's rows run upwards: reversing them makes the image upright. A camera mounted upside down needs
+        # both axes reversed on top, which leaves the columns.
         return np.ascontiguousarray(image[:, ::-1] if self._upside_down else image[::-1])
 
 

@@ -60,6 +60,7 @@ class Demonstrations:
             "variations": f"0-{n_variations - 1}",
             "variation_set": variation_set,
             "noise": self.preset.noise,
+            "camera_name": self.preset.camera_name,
             "seed": 0,
             "repo_id": repo_id,
             "root": folder,

@@ -154,6 +154,7 @@ class Plan:
             "env.type": ENV_TYPE,
             "env.task": task or preset.tasks,
             "env.variation_set": self.variation_set,
+            "env.camera_name": preset.camera_name,
             "env.episode_length": preset.episode_length,
             "eval.n_episodes": preset.rollouts_per_task,
             "seed": preset.first_eval_seed,

@@ -21,6 +21,7 @@ class Preset:
         tasks: A task set or a comma-separated list.
         episodes_per_task: Demonstrations of each task.
         noise: Standard deviation of the noise on the expert's actions.
+        camera_name: The simulator's camera, or several separated by commas.
         first_eval_seed: Variation of each task's first rollout.
         rollouts_per_task: Rollouts of each task, on that variation and those after it.
         episode_length: Steps after which a rollout is a failure.
@@ -33,6 +34,7 @@ class Preset:
     tasks: str
     episodes_per_task: int
     noise: float
+    camera_name: str
     first_eval_seed: int
     rollouts_per_task: int
     episode_length: int

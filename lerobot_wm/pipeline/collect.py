@@ -12,7 +12,8 @@ from typing import Any
 import draccus
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from lerobot_wm.constants import IMAGE_SIZE, MAX_EPISODE_STEPS, REPORTED_VARIATION_SET
+from lerobot_wm.constants import CAMERA_NAME, IMAGE_SIZE, MAX_EPISODE_STEPS, REPORTED_VARIATION_SET
+from lerobot_wm.envs.cameras import parse_cameras
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import check_variation_set, parse_variations
 from lerobot_wm.pipeline.collect_report import (
@@ -56,6 +57,8 @@ class CollectConfig:
     max_attempts: int = 5
     # Height and width of the images in pixels.
     image_size: int = IMAGE_SIZE
+    # A camera of the simulator, or several separated by commas: corner2,topview.
+    camera_name: str = CAMERA_NAME
     # Seed of the noise; the dataset is the same for a seed whatever num_workers.
     seed: int = 0
     # Processes that collect in parallel.
@@ -66,6 +69,7 @@ class CollectConfig:
         resolve_tasks(self.tasks)
         parse_variations(self.variations)
         check_variation_set(self.variation_set)
+        parse_cameras(self.camera_name)
         limits = {
             "episodes_per_task": (1, None),
             "noise": (0, None),
@@ -97,6 +101,7 @@ class CollectConfig:
             "steps_after_success": self.steps_after_success,
             "max_attempts": self.max_attempts,
             "image_size": self.image_size,
+            "camera_name": ",".join(parse_cameras(self.camera_name)),
             "seed": self.seed,
         }
 
@@ -115,6 +120,7 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
             max_attempts=config.max_attempts,
             seed=config.seed,
             image_size=config.image_size,
+            cameras=parse_cameras(config.camera_name),
         )
         for task in resolve_tasks(config.tasks)
         for first in range(0, config.episodes_per_task, SHARD_EPISODES)
@@ -160,8 +166,9 @@ def _is_complete(config: CollectConfig, root: Path) -> bool:
         raise FileExistsError(
             f"{root} exists and was not made by `lerobot-wm collect`; give another --root or remove it."
         )
-    # Datasets made before there was a second set do not name theirs.
-    found = {"variation_set": REPORTED_VARIATION_SET, **json.loads(record.read_text())["config"]}
+    # Datasets made before there was a choice of these do not name theirs.
+    earlier = {"variation_set": REPORTED_VARIATION_SET, "camera_name": CAMERA_NAME}
+    found = {**earlier, **json.loads(record.read_text())["config"]}
     _refuse_difference(
         found, config.identity(), f"{root} holds a dataset", "give another --root or remove it"
     )

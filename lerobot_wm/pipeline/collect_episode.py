@@ -1,5 +1,6 @@
 """One scripted demonstration: an expert's actions with noise, recorded as they were executed."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,6 @@ from lerobot_wm.constants import (
     DONE,
     MAX_EPISODE_STEPS,
     OBS_ENV_STATE,
-    OBS_IMAGE,
     OBS_STATE,
     REWARD,
     STATE_DIM,
@@ -94,11 +94,16 @@ def demonstrate(
 
 
 def dataset_frames(
-    demonstration: Demonstration, simulation: Simulation, renderer: Renderer
+    demonstration: Demonstration, simulation: Simulation, renderers: Mapping[str, Renderer]
 ) -> list[dict[str, Any]]:
     """Draw a demonstration and lay it out as LeRobot frames (see data/schema.py).
 
     Images are drawn only here, after success is known: a failed attempt costs physics alone.
+
+    Args:
+        demonstration: what happened.
+        simulation: of the demonstration's task.
+        renderers: image feature -> what draws it.
     """
     demo = demonstration
     done = np.logical_or.accumulate(demo.successes)
@@ -107,7 +112,10 @@ def dataset_frames(
         simulation.restore(demo.physics[t])
         frames.append(
             {
-                OBS_IMAGE: renderer.render(simulation.model, simulation.data),
+                **{
+                    key: renderer.render(simulation.model, simulation.data)
+                    for key, renderer in renderers.items()
+                },
                 OBS_STATE: demo.states[t, :STATE_DIM].astype(np.float32),
                 OBS_ENV_STATE: demo.states[t].astype(np.float32),
                 ACTION: demo.actions[t],

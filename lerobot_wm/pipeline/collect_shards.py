@@ -16,8 +16,9 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.constants import CAMERA_NAME, FPS, MAX_EPISODE_STEPS, ROBOT_TYPE
+from lerobot_wm.constants import FPS, MAX_EPISODE_STEPS, ROBOT_TYPE
 from lerobot_wm.data.schema import metaworld_features
+from lerobot_wm.envs.cameras import image_features
 from lerobot_wm.envs.rendering import Renderer, RenderKey
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import task_id
@@ -42,6 +43,7 @@ class Shard:
     max_attempts: int
     seed: int
     image_size: int
+    cameras: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -106,17 +108,21 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
     temporary = folder / f"{TEMPORARY_PREFIX}{os.getpid()}-{shard.name}"
     dataset = _create_dataset(temporary, shard)
     simulation = Simulation(shard.task, shard.variation_set)
-    render_key = RenderKey(shard.task, CAMERA_NAME, shard.image_size, fast=True)
-    renderer = Renderer.acquire(render_key, simulation.model)
+    render_keys = {
+        feature: RenderKey(shard.task, camera, shard.image_size, fast=True)
+        for camera, feature in image_features(shard.cameras).items()
+    }
+    renderers = {feature: Renderer.acquire(key, simulation.model) for feature, key in render_keys.items()}
     record = ShardRecord(episodes=[], failures={}, seconds=0.0)
     for episode in range(shard.first, shard.first + shard.count):
         demonstration = _succeed(shard, episode, simulation, record)
-        for frame in dataset_frames(demonstration, simulation, renderer):
+        for frame in dataset_frames(demonstration, simulation, renderers):
             dataset.add_frame(frame)
         dataset.save_episode()
         on_episode()
     dataset.finalize()
-    Renderer.release(render_key)
+    for key in render_keys.values():
+        Renderer.release(key)
     record.seconds = time.monotonic() - start
     (temporary / SHARD_RECORD).write_text(json.dumps(asdict(record)))
     temporary.rename(folder / shard.name)
@@ -165,7 +171,7 @@ def _create_dataset(root: Path, shard: Shard) -> LeRobotDataset:
         root=root,
         fps=FPS,
         robot_type=ROBOT_TYPE,
-        features=metaworld_features(shard.image_size),
+        features=metaworld_features(shard.image_size, image_features(shard.cameras).values()),
         # Full chroma resolution: with yuv420p the 3-pixel red dot that marks reach-v3's goal is lost.
         rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=10),
         streaming_encoding=True,

@@ -81,14 +81,15 @@ def encode(
 
     Raises:
         FileExistsError: `output_root` is there already.
-        ValueError: The dataset lacks the world model's camera or proprioception, or latents are not finite.
+        ValueError: The dataset lacks a camera of the world model or proprioception, or latents are not finite.
     """
     if output_root.exists():
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
-    if policy.config.image_key not in source.meta.camera_keys:
+    missing = [key for key in policy.config.cameras if key not in source.meta.camera_keys]
+    if missing:
         raise ValueError(
-            f"The world model watches '{policy.config.image_key}'; {source.repo_id} has the cameras "
-            f"{source.meta.camera_keys}: use a dataset with that camera."
+            f"The world model watches {', '.join(missing)}; {source.repo_id} has the cameras "
+            f"{', '.join(source.meta.camera_keys) or 'none'}: use a dataset with all it watches."
         )
     if OBS_STATE not in source.meta.features:
         raise ValueError(

@@ -10,7 +10,8 @@ from torch.nn.utils.rnn import pad_sequence
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.tables import column_tensor
-from lerobot_wm.policies.frozen_encoder import EncoderPolicy, FrozenEncoder, encoder_images
+from lerobot_wm.policies.cameras import stack_images
+from lerobot_wm.policies.frozen_encoder import EncoderPolicy
 
 _EPISODES_PER_BATCH = 16
 _FRAMES_PER_CHUNK = 512  # images per encoder call: bounds memory whatever the length of the episodes
@@ -31,10 +32,10 @@ def filter_episodes(
         For each episode in order, s_t for its frames: (T, L) float32 on the CPU.
     """
     policy.eval()
-    world_model, image_key = policy.world_model, policy.config.image_key
-    assert image_key is not None  # every encoder has a camera
+    world_model, image_size = policy.world_model, policy.config.image_size
     device = next(world_model.parameters()).device
-    frames = camera_frames(dataset, image_key)  # (N, H, W, C) uint8, by absolute index
+    # Of each camera (N, H, W, C) uint8, by absolute index.
+    cameras = [camera_frames(dataset, key) for key in policy.config.cameras]
     columns = {
         key: column_tensor(dataset.hf_dataset, key, tuple(dataset.meta.features[key]["shape"]))
         for key in ("episode_index", "index", ACTION, OBS_STATE)
@@ -50,7 +51,10 @@ def filter_episodes(
             index = columns["index"][rows].split(_FRAMES_PER_CHUNK)
             proprio = columns[OBS_STATE][rows].to(device).split(_FRAMES_PER_CHUNK)
             chunks = [
-                world_model.embed(_images(world_model, frames[i].to(device))[None], p[None])[0]
+                world_model.embed(
+                    stack_images([_images(frames[i].to(device)) for frames in cameras], image_size)[None],
+                    p[None],
+                )[0]
                 for i, p in zip(index, proprio, strict=True)
             ]
             embeds.append(torch.cat(chunks))  # (T, E)
@@ -61,6 +65,6 @@ def filter_episodes(
             yield latents[: rows.stop - rows.start]
 
 
-def _images(encoder: FrozenEncoder, frames: Tensor) -> Tensor:
-    """(T, H, W, C) uint8 -> (T, C, H, W) in [0, 1], of the encoder's size."""
-    return encoder_images(encoder, frames.movedim(-1, -3).float() / 255)
+def _images(frames: Tensor) -> Tensor:
+    """(T, H, W, C) uint8 -> (T, C, H, W) in [0, 1]."""
+    return frames.movedim(-1, -3).float() / 255

@@ -9,6 +9,7 @@ from torch import Tensor
 from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.augment import random_crop
 from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder
+from lerobot_wm.policies.cameras import camera_images, check_images
 from lerobot_wm.policies.e2e_config import E2EConfig
 from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
 
@@ -26,7 +27,7 @@ class E2EPolicy(MultiTaskPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
-        config.input_features = {key: config.input_features[key] for key in (config.camera, OBS_STATE)}
+        config.input_features = {key: config.input_features[key] for key in (*config.cameras, OBS_STATE)}
         self.observation_dim = FEATURE_DIM + len(config.tasks) + config.state_dim
         self.encoder = ImageEncoder(config.encoder, config.image_shape)
 
@@ -34,7 +35,8 @@ class E2EPolicy(MultiTaskPolicy):
         """Encode the images and join the heads' input.
 
         Args:
-            images: The camera, (B, C, H, W) in [0, 1]; shifted at random in training where the configuration says so.
+            images: The stacked cameras, (B, C, H, W) in [0, 1]; in training shifted at random where the configuration
+                says so, the cameras of a frame alike.
             state: Proprioception in the dataset's units, (B, P).
             tasks: One-hot task ids, (B, N).
 
@@ -53,22 +55,16 @@ class E2EPolicy(MultiTaskPolicy):
         """Act on the current image: the policy's mean action, clipped to the dataset's range.
 
         Args:
-            batch: The camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings).
+            batch: Each camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings).
             **kwargs: Not used; LeRobot passes options of other policies.
 
         Returns:
             Actions in the dataset's units, (B, A).
 
         Raises:
-            ValueError: The image has another size than in training, or the task is unknown.
+            ValueError: A camera is missing or has another size than in training, or the task is unknown.
         """
-        images, state = batch[self.config.camera], batch[OBS_STATE]
-        found, expected = tuple(images.shape[1:]), self.config.image_shape
-        if found != expected:
-            raise ValueError(
-                f"'{self.config.camera}' is {found}, this policy was trained on {expected} (C, H, W): set the "
-                f"camera or environment to {expected[1]}x{expected[2]} (--env.image_size={expected[1]} for "
-                "metaworld_mt)."
-            )
+        check_images(self.config, batch)
+        images, state = camera_images(self.config, batch), batch[OBS_STATE]
         observation = self.observation(images, state, self.one_hot_tasks(batch, state.shape[0]))
         return self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))

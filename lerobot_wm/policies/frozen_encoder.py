@@ -8,8 +8,7 @@ from torch import Tensor
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
 from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy, resize_images
-from lerobot_wm.world_model.model import WorldModel
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 
 EncoderPolicy = WMRSSMPolicy | FrozenBackbonePolicy
 
@@ -29,8 +28,8 @@ class FrozenEncoder(Protocol):
     """The interface that `WorldModel` and `FrozenBackbone` have in common; both are modules.
 
     Whole episodes are encoded by `embed` and then `filter_embeds`, a running episode frame by frame by `observe`: the
-    latents are the same. Images are (B, T, C, H, W) in [0, 1], actions (B, T, A) and proprioception (B, T, P) in the
-    dataset's units; an encoder ignores what it does not read.
+    latents are the same. Images are (B, T, C, H, W) in [0, 1], several cameras stacked along channels; actions
+    (B, T, A) and proprioception (B, T, P) are in the dataset's units. An encoder ignores what it does not read.
     """
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
@@ -60,8 +59,3 @@ def load_encoder(path: str) -> EncoderPolicy:
     if isinstance(config, FrozenBackboneConfig):
         return FrozenBackbonePolicy.from_pretrained(path, config=config)
     raise ValueError(f"{path} is a {config.type} checkpoint; expected one of a wm_rssm or a frozen_backbone.")
-
-
-def encoder_images(encoder: FrozenEncoder, images: Tensor) -> Tensor:
-    """Images (..., C, H, W) in [0, 1] as the encoder takes them: a world model at its own size, a backbone at any."""
-    return resize_images(images) if isinstance(encoder, WorldModel) else images

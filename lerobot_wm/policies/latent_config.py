@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 from lerobot_wm.constants import OBS_ENV_STATE
+from lerobot_wm.nn.conv import IMAGE_SIZE
+from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.features import feature_dim
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import BackboneConfig
 from lerobot_wm.policies.multi_task_config import MultiTaskConfig
@@ -10,7 +12,7 @@ from lerobot_wm.world_model.config import RSSMConfig
 
 
 @dataclass
-class LatentPolicyConfig(MultiTaskConfig):
+class LatentPolicyConfig(ImagePolicyConfig, MultiTaskConfig):
     """A small multi-task policy on [latent, one-hot task, proprioception] (paper section 3.1.2).
 
     Args:
@@ -28,8 +30,12 @@ class LatentPolicyConfig(MultiTaskConfig):
     use_environment_state: bool = False
     rssm: RSSMConfig | None = None
     frozen_backbone: BackboneConfig | None = None
-    image_key: str | None = None
     world_model_fingerprint: str | None = None
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """As its encoder takes images: a world model at its own size, a backbone at the first camera's."""
+        return super().image_size if self.rssm is None else (IMAGE_SIZE, IMAGE_SIZE)
 
     @property
     def env_state_dim(self) -> int:

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.nn.normalize import Affine
+from lerobot_wm.policies.cameras import camera_images, check_images
 from lerobot_wm.policies.features import stat
-from lerobot_wm.policies.frozen_encoder import LatentState, encoder_images
+from lerobot_wm.policies.frozen_encoder import LatentState
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.latent_setup import adopt_encoder, check_latents, deployed_features, make_encoder
 from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
@@ -117,7 +118,7 @@ class LatentPolicy(MultiTaskPolicy):
         """Filter the new image and act on the state: the policy's mean action, clipped to the dataset's range.
 
         Args:
-            batch: The camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings), and
+            batch: Each camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings), and
                 `observation.environment_state` (B, F) with `use_environment_state`.
             **kwargs: Not used; LeRobot passes options of other policies.
 
@@ -125,7 +126,8 @@ class LatentPolicy(MultiTaskPolicy):
             Actions in the dataset's units, (B, A).
 
         Raises:
-            ValueError: The image has another size than in training, the task is unknown, or the full state missing.
+            ValueError: A camera is missing or has another size than in training, the task is unknown, or the full
+                state is missing.
         """
         state = batch[OBS_STATE]
         latent = self._filter(batch) if self.config.use_latent else None
@@ -137,22 +139,14 @@ class LatentPolicy(MultiTaskPolicy):
 
     def _filter(self, batch: dict[str, Any]) -> Tensor:
         """Advance the filter by one frame and return s_t, (B, L)."""
-        key = self.config.image_key
-        assert key is not None
-        image = batch[key]
-        expected = tuple(self.config.input_features[key].shape)
-        if tuple(image.shape[1:]) != expected:
-            raise ValueError(
-                f"'{key}' is {tuple(image.shape[1:])}, the world model was trained on {expected} "
-                f"(C, H, W): set the camera or environment to {expected[1]}x{expected[2]} "
-                f"(--env.image_size={expected[1]} for metaworld_mt)."
-            )
+        check_images(self.config, batch)
+        images = camera_images(self.config, batch)  # (B, C, H, W)
         # LeRobot gives no batch size at reset: the state is made when the first frame shows it.
-        if self._prev_action is None or self._prev_action.shape[0] != image.shape[0]:
+        if self._prev_action is None or self._prev_action.shape[0] != images.shape[0]:
             self._filter_state = None
-            self._prev_action = image.new_zeros(image.shape[0], self.config.action_dim)
+            self._prev_action = images.new_zeros(images.shape[0], self.config.action_dim)
         states = self.world_model.observe(
-            encoder_images(self.world_model, image)[:, None],
+            images[:, None],
             self._prev_action[:, None],
             self._filter_state,  # type: ignore[arg-type]  # of the encoder's own kind
             batch[OBS_STATE][:, None],

@@ -34,7 +34,7 @@ def adopt_encoder(config: LatentPolicyConfig) -> WorldModel | FrozenBackbone:
     else:
         config.frozen_backbone = policy.world_model.config
     config.image_key = policy.config.image_key
-    config.input_features[config.image_key] = policy.config.input_features[config.image_key]
+    config.input_features |= {key: policy.config.input_features[key] for key in policy.config.cameras}
     config.world_model_fingerprint = weights_fingerprint(policy.world_model)
     return policy.world_model
 
@@ -48,12 +48,12 @@ def make_encoder(config: LatentPolicyConfig) -> WorldModel | FrozenBackbone:
 
 
 def deployed_features(config: LatentPolicyConfig) -> dict[str, PolicyFeature]:
-    """What the policy reads at test time: camera and proprioception, not the stored latent.
+    """What the policy reads at test time: cameras and proprioception, not the stored latent.
 
     Raises:
         ValueError: The dataset has no proprioception.
     """
-    wanted = {OBS_STATE, config.image_key, OBS_ENV_STATE if config.use_environment_state else None}
+    wanted = {OBS_STATE, *config.cameras, OBS_ENV_STATE if config.use_environment_state else None}
     features = {key: feature for key, feature in config.input_features.items() if key in wanted}
     if OBS_STATE not in features or features[OBS_STATE].type is not FeatureType.STATE:
         raise ValueError(f"The dataset has no '{OBS_STATE}'; it has {sorted(config.input_features)}.")

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.policies.cameras import camera_images, side_by_side
 from lerobot_wm.policies.latent_policy import LatentPolicy
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy, resize_images
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.model import WorldModel
 
 CONTEXT = 5  # frames the model sees
@@ -28,9 +29,9 @@ EPISODES_PER_TASK = 4
 class OpenLoop:
     """Predictions on one task's episodes, from their first frames on.
 
-    `truth` (CONTEXT + H, C, H, W) and `imagined` (H, C, H, W) are the first episode's images in [0, 1].
-    PSNR is in dB by horizon, from the squared error averaged over pixels and episodes; `copy_psnr` is that of
-    repeating the last frame seen.
+    `truth` (CONTEXT + H, C, H, W) and `imagined` (H, C, H, W) are the first episode's images in [0, 1], several
+    cameras side by side. PSNR is in dB by horizon, from the squared error averaged over the pixels of all cameras and
+    over episodes; `copy_psnr` is that of repeating the last frame seen.
     """
 
     task: str
@@ -64,7 +65,7 @@ def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | Non
     """
     fps = LeRobotDatasetMetadata(repo_id, root=root).fps
     times = [step / fps for step in range(WINDOW)]
-    keys = (policy.config.image_key, ACTION, OBS_STATE)
+    keys = (*policy.config.cameras, ACTION, OBS_STATE)
     dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(keys, times))
     starts: dict[str, list[int]] = {}
     for episode in dataset.meta.episodes:
@@ -85,19 +86,17 @@ def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[s
     Args:
         policy: holds the world model.
         task: what the windows show.
-        windows: each the first WINDOW frames of an episode: camera (T, C, H, W) in [0, 1], `action` (T, A),
+        windows: each the first WINDOW frames of an episode: every camera (T, C, H, W) in [0, 1], `action` (T, A),
             `observation.state` (T, P).
     """
-
-    def batch(key: str) -> Tensor:
-        return torch.stack([window[key] for window in windows]).to(policy.config.device)
-
-    world_model, image_key = policy.world_model, policy.config.image_key
+    config, world_model = policy.config, policy.world_model
     assert isinstance(world_model, WorldModel)  # as load_world_model checked
-    assert image_key is not None  # whoever holds a world model has a camera
-    images = resize_images(batch(image_key))  # (B, T, C, 64, 64)
-    actions = batch(ACTION)  # (B, T, A)
-    proprio = batch(OBS_STATE)[:, :CONTEXT] if world_model.config.use_proprio else None
+    batch = {
+        key: torch.stack([window[key] for window in windows]).to(config.device)
+        for key in (*config.cameras, ACTION, OBS_STATE)
+    }
+    images, actions = camera_images(config, batch), batch[ACTION]  # (B, T, C, 64, 64), (B, T, A)
+    proprio = batch[OBS_STATE][:, :CONTEXT] if world_model.config.use_proprio else None
     context = world_model.filter(images[:, :CONTEXT], actions[:, :CONTEXT], proprio)
     # The first imagined step is reached by the action executed at the last frame seen.
     states = world_model.imagine(context.last(), actions[:, CONTEXT - 1 : -1])
@@ -106,8 +105,8 @@ def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[s
     return OpenLoop(
         task=task,
         n_episodes=len(windows),
-        truth=images[0].cpu().numpy(),
-        imagined=imagined[0].cpu().numpy(),
+        truth=side_by_side(images[0], len(config.cameras)).cpu().numpy(),
+        imagined=side_by_side(imagined[0], len(config.cameras)).cpu().numpy(),
         psnr=_psnr(imagined, future),
         copy_psnr=_psnr(last_seen, future),
     )
@@ -120,7 +119,9 @@ def psnr(squared_error: float) -> float:
 
 def strips_figure(results: list[OpenLoop]) -> Figure:
     """Two rows per task, truth above imagination: the last context frame, then the horizons."""
-    figure = Figure(figsize=(1.3 * (len(HORIZONS) + 1), 2.75 * len(results)), layout="constrained")
+    height, width = results[0].truth.shape[-2:]
+    figsize = (1.3 * width / height * (len(HORIZONS) + 1), 2.75 * len(results))
+    figure = Figure(figsize=figsize, layout="constrained")
     axes = figure.subplots(2 * len(results), len(HORIZONS) + 1, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")

@@ -9,6 +9,7 @@ import draccus
 import torch
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from lerobot_wm.policies.cameras import side_by_side
 from lerobot_wm.report.inline import PNG, SVG, figure_bytes
 from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model
 from lerobot_wm.report.provenance import provenance
@@ -72,10 +73,9 @@ def quality(cfg: QualityConfig) -> Path:
         ValueError: The checkpoint holds no world model, or a dataset cannot be judged on.
     """
     policy = load_world_model(cfg.world_model_path)
-    world_model, image_key = policy.world_model, policy.config.image_key
+    world_model, cameras = policy.world_model, policy.config.cameras
     assert isinstance(world_model, WorldModel)  # as load_world_model checked
-    assert image_key is not None  # whoever holds a world model has a camera
-    training, episodes = _read_datasets(cfg, image_key)
+    training, episodes = _read_datasets(cfg, cameras)
     n_seen = _count_seen(training, episodes)
 
     logger.info("Filtering %d episodes", len(training) + len(episodes))
@@ -85,9 +85,12 @@ def quality(cfg: QualityConfig) -> Path:
     long = [i for i, episode in enumerate(episodes) if len(episode.actions) >= WINDOW]
     tasks = [episodes[i].task for i in long]
     mean_image, median_image = mean_and_median_image(episodes)
-    images = predictions(
+    stacked = predictions(
         world_model, [episodes[i] for i in long], [filtered[i] for i in long], mean_image, cfg.seed
     )
+    # Side by side, each camera has a foreground of its own.
+    images = {name: side_by_side(of_name, len(cameras)) for name, of_name in stacked.items()}
+    median_image = side_by_side(median_image, len(cameras))
 
     logger.info("Fitting probes")
     all_untrained = filter_episodes(untrained(world_model, cfg.seed), training + episodes)
@@ -126,15 +129,15 @@ def quality(cfg: QualityConfig) -> Path:
     return path
 
 
-def _read_datasets(cfg: QualityConfig, image_key: str) -> tuple[list[Episode], list[Episode]]:
+def _read_datasets(cfg: QualityConfig, cameras: list[str]) -> tuple[list[Episode], list[Episode]]:
     """Episodes of the training data (none where it is not given) and those to judge on."""
     training = []
     if cfg.train_dataset is not None:
         training = read_episodes(
-            cfg.train_dataset.repo_id, cfg.train_dataset.root, image_key, PROBE_EPISODES_PER_TASK, cfg.seed
+            cfg.train_dataset.repo_id, cfg.train_dataset.root, cameras, PROBE_EPISODES_PER_TASK, cfg.seed
         )
     judged_on = cfg.dataset.repo_id
-    episodes = read_episodes(judged_on, cfg.dataset.root, image_key, cfg.episodes_per_task, cfg.seed)
+    episodes = read_episodes(judged_on, cfg.dataset.root, cameras, cfg.episodes_per_task, cfg.seed)
     n_long = sum(len(episode.actions) >= WINDOW for episode in episodes)
     if n_long < 2:
         raise ValueError(

@@ -11,7 +11,8 @@ from torch.nn.utils.rnn import pad_sequence
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, SUCCESS, VARIATION
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.tables import column_tensor
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import resize_images
+from lerobot_wm.nn.conv import IMAGE_SIZE
+from lerobot_wm.policies.cameras import stack_images
 from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import RSSMState
 
@@ -26,7 +27,7 @@ class Episode:
 
     task: str
     variation: int
-    frames: Tensor  # (T, H, W, C) uint8, a view of the memory-mapped cache
+    frames: list[Tensor]  # of each camera (T, H, W, C) uint8, a view of the memory-mapped cache
     actions: Tensor  # (T, A)
     proprio: Tensor  # (T, P)
     env_state: Tensor  # (T, 39)
@@ -34,7 +35,8 @@ class Episode:
 
     def images(self, steps: slice | list[int]) -> Tensor:
         """The images of these steps as the world model sees them, (N, C, 64, 64) in [0, 1]."""
-        return resize_images(self.frames[steps].movedim(-1, -3).float() / 255)
+        images = [frames[steps].movedim(-1, -3).float() / 255 for frames in self.frames]  # (N, C, H, W) each
+        return stack_images(images, (IMAGE_SIZE, IMAGE_SIZE))
 
 
 @dataclass(frozen=True)
@@ -68,14 +70,16 @@ def choose_episodes(episodes: pd.DataFrame, per_task: int, seed: int) -> list[in
     return sorted(by_turn.groupby("task_index").head(per_task)["episode_index"].tolist())
 
 
-def read_episodes(repo_id: str, root: str | None, image_key: str, per_task: int, seed: int) -> list[Episode]:
+def read_episodes(
+    repo_id: str, root: str | None, cameras: list[str], per_task: int, seed: int
+) -> list[Episode]:
     """Episodes of a Meta-World dataset; only those chosen are decoded.
 
     Raises:
         ValueError: The dataset lacks a feature, such as the objects' true positions.
     """
     dataset = LeRobotDataset(repo_id, root=root)
-    missing = [key for key in (image_key, *NEEDED) if key not in dataset.meta.features]
+    missing = [key for key in (*cameras, *NEEDED) if key not in dataset.meta.features]
     if missing:
         raise ValueError(
             f"{repo_id} has no {missing}, which judging a world model needs: use a dataset of `lerobot-wm collect`."
@@ -88,7 +92,7 @@ def read_episodes(repo_id: str, root: str | None, image_key: str, per_task: int,
     )
     chosen = choose_episodes(table.drop_duplicates("episode_index"), per_task, seed)
     dataset = LeRobotDataset(repo_id, root=root, episodes=chosen)
-    frames = camera_frames(dataset, image_key)  # (N, H, W, C), by absolute index
+    of_cameras = [camera_frames(dataset, key) for key in cameras]  # (N, H, W, C) each, by absolute index
     columns = {
         key: column_tensor(dataset.hf_dataset, key, tuple(dataset.meta.features[key]["shape"]))
         for key in (*NEEDED, "episode_index", "index", "task_index")
@@ -100,7 +104,7 @@ def read_episodes(repo_id: str, root: str | None, image_key: str, per_task: int,
         Episode(
             task=tasks[int(per_episode["task_index"][i][0])],
             variation=int(per_episode[VARIATION][i][0]),
-            frames=frames[int(index[0]) : int(index[-1]) + 1],
+            frames=[frames[int(index[0]) : int(index[-1]) + 1] for frames in of_cameras],
             actions=per_episode[ACTION][i],
             proprio=per_episode[OBS_STATE][i],
             env_state=per_episode[OBS_ENV_STATE][i],

@@ -35,7 +35,9 @@ def examples_figure(images: dict[str, Tensor], tasks: list[str], horizons: tuple
     """
     columns = ("copy last frame", "truth", "closed loop", "open loop", "shuffled actions")
     names = list(dict.fromkeys(tasks))
-    figure = Figure(figsize=(1.5 * (len(columns) + 0.8), 1.6 * len(names)), layout="constrained")
+    height, width = images["truth"].shape[-2:]
+    figsize = (1.5 * width / height * (len(columns) + 0.8), 1.6 * len(names))
+    figure = Figure(figsize=figsize, layout="constrained")
     axes = figure.subplots(len(names), len(columns), squeeze=False)
     for row, task in zip(axes, names, strict=True):
         episode = tasks.index(task)

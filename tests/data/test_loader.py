@@ -63,13 +63,11 @@ def test_past_frames_and_uneven_deltas_equal_lerobots(demos_root: Path) -> None:
     assert_equal_batches(dataset, some_indices(dataset))
 
 
-def test_png_dataset_equals_lerobots(tmp_path: Path) -> None:
+def test_png_dataset_of_two_cameras_equals_lerobots(tmp_path: Path) -> None:
+    shapes = {"observation.images.left": (20, 24, 3), "observation.images.right": (12, 10, 3)}
+    names = ["height", "width", "channels"]
     features = {
-        "observation.image": {
-            "dtype": "image",
-            "shape": (20, 24, 3),
-            "names": ["height", "width", "channels"],
-        },
+        **{key: {"dtype": "image", "shape": shape, "names": names} for key, shape in shapes.items()},
         "observation.state": {"dtype": "float32", "shape": (3,), "names": None},
         "action": {"dtype": "float32", "shape": (1,), "names": None},
     }
@@ -79,7 +77,7 @@ def test_png_dataset_equals_lerobots(tmp_path: Path) -> None:
         for _ in range(length):
             dataset.add_frame(
                 {
-                    "observation.image": rng.integers(0, 256, (20, 24, 3), dtype=np.uint8),
+                    **{key: rng.integers(0, 256, shape, dtype=np.uint8) for key, shape in shapes.items()},
                     "observation.state": rng.random(3, dtype=np.float32),
                     "action": rng.random(1, dtype=np.float32),
                     "task": "look",
@@ -87,7 +85,7 @@ def test_png_dataset_equals_lerobots(tmp_path: Path) -> None:
             )
         dataset.save_episode()
     dataset.finalize()
-    deltas = {"observation.image": [0.0, 0.1], "action": [0.0, 0.1]}
+    deltas = {key: [0.0, 0.1] for key in (*shapes, "action")}
     dataset = LeRobotDataset("test/png", root=tmp_path / "png", delta_timestamps=deltas)
     assert_equal_batches(dataset, list(range(10)))
 

@@ -31,6 +31,24 @@ def test_environment_state_reaches_policies_under_lerobots_name() -> None:
     vector_env.close()
 
 
+def test_several_cameras_reach_policies_under_their_names() -> None:
+    config = MetaworldMTEnvConfig(task="reach-v3", camera_name="corner2,topview", episode_length=1)
+    keys = ["observation.images.corner2", "observation.images.topview"]
+    features = env_to_policy_features(config)
+    assert {key: features[key].shape for key in keys} == dict.fromkeys(keys, (3, 64, 64))
+    assert OBS_IMAGE not in features
+    vector_env = make_env(config, n_envs=2)["reach-v3"][0]
+    batch = preprocess_observation(vector_env.reset(seed=[4, 5])[0])
+    assert {key: tuple(batch[key].shape) for key in batch if "image" in key} == dict.fromkeys(
+        keys, (2, 3, 64, 64)
+    )
+    observation = vector_env.step(np.ones((2, 4), dtype=np.float32))[0]
+    frozen = vector_env.step(np.ones((2, 4), dtype=np.float32))[0]
+    for camera in ("corner2", "topview"):
+        np.testing.assert_array_equal(frozen["pixels"][camera], observation["pixels"][camera])
+    vector_env.close()
+
+
 def test_one_group_per_task_built_lazily() -> None:
     envs = make_env(MetaworldMTEnvConfig(), n_envs=50)
     assert list(envs) == list(MT6)

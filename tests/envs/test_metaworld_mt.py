@@ -55,7 +55,7 @@ def test_first_frame_is_not_stale(make_env: MakeEnv, task: str) -> None:
         env.step(np.array([0.0, 1.0, -1.0, 1.0]))
     image = env.reset(seed=4)[0]["pixels"]
     mujoco.mj_forward(env._sim.model, env._sim.data)  # recomputes all positions
-    np.testing.assert_array_equal(image, env._renderer.render(env._sim.model, env._sim.data))
+    np.testing.assert_array_equal(image, env._renderers["corner2"].render(env._sim.model, env._sim.data))
     before = env.environment_state
     env.step(np.zeros(4))
     assert np.abs(env.environment_state - before)[4:7].max() < 0.005  # the object hardly moves in 0.0125 s
@@ -90,6 +90,22 @@ def test_environment_state_is_observed_on_demand(make_env: MakeEnv, actions: np.
         )
         observation, *_ = env.step(action)
     assert "environment_state" not in make_env("window-close-v3").reset(seed=0)[0]
+
+
+def test_several_cameras_are_those_seen_one_by_one(make_env: MakeEnv, actions: np.ndarray) -> None:
+    cameras = ("topview", "corner2", "corner")
+    env = make_env("reach-v3", camera_name=",".join(cameras))
+    one_by_one = [episode(make_env("reach-v3", camera_name=camera), 3, actions)[1] for camera in cameras]
+    observation, _ = env.reset(seed=3)
+    for t, action in enumerate(actions):
+        assert env.observation_space.contains(observation)
+        assert tuple(observation["pixels"]) == cameras
+        for camera, images in zip(cameras, one_by_one, strict=True):
+            np.testing.assert_array_equal(observation["pixels"][camera], images[t])
+        np.testing.assert_array_equal(env.render(), np.concatenate([x[t] for x in one_by_one], axis=1))
+        observation, *_ = env.step(action)
+    env.close()
+    assert env.render().shape == (64, 192, 3)
 
 
 def test_expert_succeeds_and_ends_the_episode(make_env: MakeEnv) -> None:

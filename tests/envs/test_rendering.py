@@ -78,6 +78,23 @@ def test_cameras_and_slow_rendering(make_env: MakeEnv, camera_name: str) -> None
     assert 0.1 < difference < 30
 
 
+def test_cameras_are_upright(make_env: MakeEnv) -> None:
+    """Lifting the hand moves it up in the pictures of those mounted upside down."""
+    for camera in ("corner2", "corner", "corner3"):
+        env = make_env("reach-v3", camera_name=camera, image_size=64)
+        before = env.reset(seed=0)[0]["pixels"].astype(int)
+        for _ in range(15):
+            after = env.step(np.array([0.0, 0.0, 1.0, -1.0]))[0]["pixels"].astype(int)
+        rows = [fingers_row(image) for image in (before, after)]
+        assert rows[1] < rows[0] - 1, camera  # rows are counted from the top
+
+
+def fingers_row(image: np.ndarray) -> float:
+    """Mean row of the gripper's fingers, white and cyan, in an image (H, W, 3)."""
+    blue = image[..., 2] > 200
+    return float(np.nonzero(blue)[0].mean())
+
+
 def test_missing_gl_says_what_to_install() -> None:
     code = "from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv; MetaworldMTEnv('reach-v3').reset(seed=0)"
     # EGL without any device to draw on, as on a machine without Mesa's drivers.

@@ -223,21 +223,29 @@ def test_other_image_size() -> None:
         make_policy("e2e_bc").select_action({**seen(1), CAMERA: torch.zeros(1, 3, 96, 96)})
 
 
-def test_several_cameras_need_a_choice() -> None:
+def test_several_cameras_are_stacked_at_the_first_ones_size() -> None:
     features = {
         "observation.images.left": PolicyFeature(FeatureType.VISUAL, (3, 16, 20)),
         "observation.images.right": PolicyFeature(FeatureType.VISUAL, (3, 24, 24)),
         STATE: PolicyFeature(FeatureType.STATE, (4,)),
     }
-    with pytest.raises(ValueError, match=r"sees one camera.*left.*right.*--policy\.image_key"):
-        make_policy("e2e_bc", input_features=dict(features))
-    policy = make_policy("e2e_bc", input_features=dict(features), image_key="observation.images.right").eval()
+    policy = make_policy("e2e_bc", input_features=dict(features)).eval()
+    assert policy.config.image_shape == (6, 16, 20)
     frames = {
+        "observation.images.left": torch.rand(1, 3, 16, 20),
         "observation.images.right": torch.rand(1, 3, 24, 24),
         STATE: torch.zeros(1, 4),
         "task": ["Push"],
     }
-    assert policy.select_action(frames).shape == (1, 2)
+    action = policy.select_action(frames)
+    for key in ("observation.images.left", "observation.images.right"):
+        assert not torch.allclose(action, policy.select_action({**frames, key: 1 - frames[key]})), key
+    policy.train()(frames | {"action": torch.zeros(1, 2)})[0].backward()
+
+    chosen = make_policy("e2e_bc", input_features=dict(features), image_key="observation.images.right").eval()
+    assert list(chosen.config.input_features) == ["observation.images.right", STATE]
+    del frames["observation.images.left"]
+    assert chosen.select_action(frames).shape == (1, 2)
 
 
 def test_wrong_options() -> None:

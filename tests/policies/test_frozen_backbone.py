@@ -262,7 +262,20 @@ def test_a_policy_is_no_encoder(policy_path: Path) -> None:
         load_encoder(str(policy_path))
 
 
-def test_one_camera_is_chosen() -> None:
+def test_a_camera_is_needed() -> None:
     config = FrozenBackboneConfig(device="cpu")
-    with pytest.raises(ValueError, match=r"encodes one camera.*none"):
+    with pytest.raises(ValueError, match=r"cameras none"):
         config.validate_features()
+
+
+@torch.no_grad()
+def test_features_of_several_cameras_stand_beside_each_other() -> None:
+    torch.manual_seed(0)
+    two = FrozenBackbone(BackboneConfig("resnet18", 32, n_cameras=2))
+    one = FrozenBackbone(BackboneConfig("resnet18", 32))
+    one.load_state_dict(two.state_dict())
+    left, right = torch.rand(2, 1, 4, 3, 48, 48)  # (B, T, 3, H, W) each
+    features = two.embed(torch.cat([left, right], dim=2))
+    assert features.shape == (1, 4, 2 * FEATURES)
+    assert two.config.latent_dim == 2 * FEATURES
+    torch.testing.assert_close(features, torch.cat([one.embed(left), one.embed(right)], dim=-1))

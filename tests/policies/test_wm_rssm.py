@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy, resize_images
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
 SHORT = "--policy.type=wm_rssm --steps=2 --batch_size=2 --log_freq=1 --policy.window_length=4"
@@ -85,14 +84,6 @@ def test_a_world_model_chooses_no_actions(world_model_path: Path) -> None:
         WMRSSMPolicy.from_pretrained(world_model_path).select_action({})
 
 
-def test_several_cameras_ask_for_a_choice(demos: LeRobotDataset, world_model_path: Path) -> None:
-    config = WMRSSMPolicy.from_pretrained(world_model_path).config
-    config.input_features["observation.images.wrist"] = config.input_features["observation.image"]
-    config.image_key = None
-    with pytest.raises(ValueError, match=r"observation\.images\.wrist.*--policy\.image_key"):
-        config.validate_features()
-
-
 def test_other_action_size_is_refused(world_model_path: Path) -> None:
     config = WMRSSMPolicy.from_pretrained(world_model_path).config
     config.output_features["action"].shape = (7,)
@@ -118,11 +109,3 @@ def test_broken_checkpoints_are_refused(world_model_path: Path, tmp_path: Path, 
         weights.write_bytes(weights.read_bytes()[:1000])
     with pytest.raises(ValueError, match="NaN or Inf" if fault == "NaN" else "does not fit"):
         WMRSSMPolicy.from_pretrained(broken)
-
-
-def test_larger_images_are_averaged_down() -> None:
-    images = torch.rand(2, 5, 3, 128, 192)
-    small = resize_images(images)
-    assert small.shape == (2, 5, 3, 64, 64)
-    torch.testing.assert_close(small[0, 0, 0, 0, 0], images[0, 0, 0, :2, :3].mean())
-    assert resize_images(small) is small

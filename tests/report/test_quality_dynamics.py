@@ -21,7 +21,7 @@ def world_model(world_model_path: Path) -> WorldModel:
 
 @pytest.fixture(scope="module")
 def episodes(demos_root: Path) -> list[Episode]:
-    return read_episodes("test/demos", str(demos_root), OBS_IMAGE, per_task=1, seed=0)
+    return read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=1, seed=0)
 
 
 @pytest.fixture(scope="module")

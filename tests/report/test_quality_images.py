@@ -28,7 +28,7 @@ from tests.report.quality_model import lively_world_model
 
 @pytest.fixture(scope="module")
 def episodes(demos_root: Path) -> list[Episode]:
-    chosen = read_episodes("test/demos", str(demos_root), OBS_IMAGE, per_task=3, seed=0)
+    chosen = read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=3, seed=0)
     return [episode for episode in chosen if len(episode.actions) >= WINDOW]
 
 
@@ -63,7 +63,7 @@ def test_an_image_without_foreground_has_no_foreground_psnr() -> None:
 def test_what_passes_by_is_in_the_mean_but_not_in_the_median_image(episodes: list[Episode]) -> None:
     frames = torch.full((50, 64, 64, 3), 100, dtype=torch.uint8)
     frames[:20, :8] = 200  # there for 2 of the 5 frames taken
-    mean, median = mean_and_median_image([replace(episodes[0], frames=frames)])
+    mean, median = mean_and_median_image([replace(episodes[0], frames=[frames])])
     torch.testing.assert_close(median, torch.full((3, 64, 64), 100 / 255))
     assert mean[0, 0, 0].item() == pytest.approx(140 / 255)
 
@@ -140,7 +140,7 @@ def test_episodes_are_spread_over_variations() -> None:
 
 
 def test_positions_tell_variations_apart(demos_root: Path) -> None:
-    episodes = read_episodes("test/demos", str(demos_root), OBS_IMAGE, per_task=4, seed=0)
+    episodes = read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=4, seed=0)
     names = {(episode.task, episode.variation) for episode in episodes}
     assert len(set(start_positions(episodes))) == len(names)
 
@@ -149,4 +149,4 @@ def test_a_dataset_without_positions_is_refused(episodes_root: Path) -> None:
     with pytest.raises(
         ValueError, match=r"test/episodes has no .*observation\.environment_state.*lerobot-wm collect"
     ):
-        read_episodes("test/episodes", str(episodes_root), OBS_IMAGE, per_task=1, seed=0)
+        read_episodes("test/episodes", str(episodes_root), [OBS_IMAGE], per_task=1, seed=0)

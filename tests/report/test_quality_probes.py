@@ -121,7 +121,7 @@ def test_the_task_is_told_from_what_holds_it(frames: Frames) -> None:
 
 def test_frames_of_real_episodes(demos_root: Path, world_model_path: Path) -> None:
     world_model = load_world_model(str(world_model_path)).world_model
-    episodes = read_episodes("test/demos", str(demos_root), OBS_IMAGE, per_task=2, seed=0)
+    episodes = read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=2, seed=0)
     filtered = filter_episodes(world_model, episodes)
     frames = draw_frames(episodes, filtered, filtered, n_fit=2, seed=0)
     assert frames.to_fit.tolist() == [i < 2 for i in range(4) for _ in range(FRAMES_PER_EPISODE)]

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
 from lerobot_wm.policies.e2e_policy import E2EPolicy
 from lerobot_wm.rl.bc import bc_loss
@@ -40,12 +41,12 @@ class E2EBCPolicy(E2EPolicy):
         """Mean squared error on a batch of frames.
 
         Args:
-            batch: The camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `action` (B, A), `task` (B strings).
+            batch: Each camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `action` (B, A), `task` (B strings).
 
         Returns:
             The scalar loss, and no parts: the loss is all there is.
         """
         state = batch[OBS_STATE]
         tasks = self.one_hot_tasks(batch, state.shape[0])  # (B, N)
-        observation = self.observation(batch[self.config.camera], state, tasks)  # (B, O)
+        observation = self.observation(camera_images(self.config, batch), state, tasks)  # (B, O)
         return bc_loss(self.actor(observation), self.action_scaling(batch[ACTION])), {}

@@ -7,6 +7,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
 from lerobot_wm.policies.e2e_policy import E2EPolicy
 from lerobot_wm.policies.iql_agent import batch_loss, make_agent
@@ -45,14 +46,14 @@ class E2EIQLPolicy(E2EPolicy):
         """Value, critic and actor losses on a batch of transitions.
 
         Args:
-            batch: The camera (B, 2, C, H, W) in [0, 1] and `observation.state` (B, 2, P) at t and t+1,
+            batch: Each camera (B, 2, C, H, W) in [0, 1] and `observation.state` (B, 2, P) at t and t+1,
                 `observation.state_is_pad` (B, 2), `action` (B, A), `next.reward` (B,), `next.done` (B,),
                 `task` (B strings).
 
         Returns:
             The sum of the losses and its parts by name.
         """
-        images, states = batch[self.config.camera], batch[OBS_STATE]  # (B, 2, C, H, W), (B, 2, P)
+        images, states = camera_images(self.config, batch), batch[OBS_STATE]  # (B, 2, C, H, W), (B, 2, P)
         tasks = self.one_hot_tasks(batch, states.shape[0])  # (B, N)
         now = self.observation(images[:, 0], states[:, 0], tasks)  # (B, O)
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""A frozen image backbone that stands where a world model stands: its latent is the image's pooled features."""
+"""A frozen image backbone that stands where a world model stands: its latent is the images' pooled features."""
 
 import difflib
 from dataclasses import dataclass
@@ -47,12 +47,13 @@ class FrozenBackbone(nn.Module):
         config.latent_dim = self._feature_dim()
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
-        """Pooled features of images (B, T, 3, H, W) in [0, 1]: (B, T, F)."""
+        """Pooled features of K cameras' images (B, T, 3·K, H, W) in [0, 1], camera after camera: (B, T, F)."""
         size = [self.config.image_size] * 2
+        each = images.unflatten(2, (self.config.n_cameras, RGB_CHANNELS))  # (B, T, K, 3, H, W)
         flat = vision.normalize(
-            vision.resize(images.flatten(0, 1), size, antialias=True), list(IMAGENET_MEAN), list(IMAGENET_STD)
-        )  # (B·T, 3, S, S)
-        return self.model(flat).unflatten(0, images.shape[:2])
+            vision.resize(each.flatten(0, 2), size, antialias=True), list(IMAGENET_MEAN), list(IMAGENET_STD)
+        )  # (B·T·K, 3, S, S)
+        return self.model(flat).unflatten(0, each.shape[:3]).flatten(2)
 
     def observe(
         self,
@@ -63,7 +64,7 @@ class FrozenBackbone(nn.Module):
         *,
         sample: bool = False,
     ) -> BackboneState:
-        """The features of images (B, T, 3, H, W) in [0, 1]; see `WorldModel.observe`."""
+        """The features of images (B, T, 3·K, H, W) in [0, 1]; see `WorldModel.observe`."""
         return BackboneState(self.embed(images))
 
     def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> BackboneState:
@@ -75,7 +76,7 @@ class FrozenBackbone(nn.Module):
         """F, found by trying: no table of models knows which image sizes they take."""
         size = self.config.image_size
         try:
-            features = self.embed(torch.zeros(1, 1, RGB_CHANNELS, size, size))
+            features = self.embed(torch.zeros(1, 1, RGB_CHANNELS * self.config.n_cameras, size, size))
         except (AssertionError, RuntimeError) as error:
             raise ValueError(
                 f"{self.config.name} takes no images of {size}x{size} ({error}): set --policy.backbone_image_size, "

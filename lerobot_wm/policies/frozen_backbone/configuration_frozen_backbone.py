@@ -5,7 +5,8 @@ from typing import NoReturn
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
-from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, image_keys
+from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.features import IDENTITY_NORMALIZATION
 
 RGB_CHANNELS = 3
 
@@ -17,17 +18,19 @@ class BackboneConfig:
     Args:
         name: A classification model of torchvision, or `timm/NAME` for one of timm.
         image_size: Height and width that images are resized to.
-        latent_dim: Number of its pooled features; filled when it is built.
+        n_cameras: Number of cameras, each encoded by itself.
+        latent_dim: Number of pooled features of all cameras together; filled when it is built.
     """
 
     name: str
     image_size: int
+    n_cameras: int = 1
     latent_dim: int = 0
 
 
 @PreTrainedConfig.register_subclass("frozen_backbone")
 @dataclass
-class FrozenBackboneConfig(PreTrainedConfig):
+class FrozenBackboneConfig(ImagePolicyConfig):
     """An image backbone in place of the world model: the control that tells what pretraining on the robot adds.
 
     It is not trained: `lerobot-wm init` writes its checkpoint, which `lerobot-wm encode` and
@@ -37,14 +40,12 @@ class FrozenBackboneConfig(PreTrainedConfig):
         backbone: A classification model of torchvision (resnet18), or `timm/NAME` for one of timm.
         weights_path: A local file with its weights, safetensors or a torch state dict (torchvision's, R3M's);
             None leaves it at its random initialisation.
-        backbone_image_size: Height and width that images are resized to; None takes the dataset's own size.
-        image_key: The camera to encode; None takes the dataset's only camera.
+        backbone_image_size: Height and width that images are resized to; None takes the first camera's size.
     """
 
     backbone: str = "resnet18"
     weights_path: str | None = None
     backbone_image_size: int | None = None
-    image_key: str | None = None
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict(IDENTITY_NORMALIZATION)
     )
@@ -65,26 +66,18 @@ class FrozenBackboneConfig(PreTrainedConfig):
         return None
 
     def validate_features(self) -> None:
-        """Choose the camera and the image size.
+        """Choose the cameras and the image size.
 
         Raises:
-            ValueError: No camera or several, or images that are not RGB.
+            ValueError: The cameras cannot be used, or their images are not RGB.
         """
-        cameras = image_keys(self.input_features)
-        if self.image_key is None and len(cameras) == 1:
-            self.image_key = cameras[0]
-        if self.image_key not in cameras:
-            raise ValueError(
-                f"frozen_backbone encodes one camera; the dataset has {cameras or 'none'} and --policy.image_key is "
-                f"{self.image_key!r}. Set --policy.image_key to one of the dataset's cameras."
-            )
-        channels, height, width = self.input_features[self.image_key].shape
-        if channels != RGB_CHANNELS:
-            raise ValueError(
-                f"'{self.image_key}' has {channels} channels; backbones are made for RGB images."
-            )
+        self.choose_cameras()
+        for key in self.cameras:
+            channels = self.input_features[key].shape[0]
+            if channels != RGB_CHANNELS:
+                raise ValueError(f"'{key}' has {channels} channels; backbones are made for RGB images.")
         if self.backbone_image_size is None:
-            self.backbone_image_size = max(height, width)
+            self.backbone_image_size = max(self.image_size)
 
     def get_optimizer_preset(self) -> NoReturn:
         """Refuse: nothing is trained.

@@ -34,7 +34,9 @@ class FrozenBackbonePolicy(StrictPolicy):
         config.validate_features()
         assert config.backbone_image_size is not None  # chosen by validate_features
         # Under the name of what it stands in for, so that encoding and latent policies treat both alike.
-        self.world_model = FrozenBackbone(BackboneConfig(config.backbone, config.backbone_image_size))
+        self.world_model = FrozenBackbone(
+            BackboneConfig(config.backbone, config.backbone_image_size, len(config.cameras))
+        )
         is_new = dataset_meta is not None  # not loaded from a checkpoint, which has the weights in it
         if is_new and config.weights_path is not None:
             load_backbone_weights(self.world_model.model, config.weights_path)

@@ -5,20 +5,24 @@ from dataclasses import dataclass, field
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
 from lerobot_wm.constants import ACTION, OBS_STATE
-from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, default_dtype, feature_dim, image_keys
+from lerobot_wm.nn.conv import IMAGE_SIZE
+from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, default_dtype, feature_dim
 from lerobot_wm.policies.optim import FusedAdamConfig
 from lerobot_wm.world_model.config import RSSMConfig
 
 
 @PreTrainedConfig.register_subclass("wm_rssm")
 @dataclass
-class WMRSSMConfig(PreTrainedConfig):
+class WMRSSMConfig(ImagePolicyConfig):
     """The paper's RSSM, trained on windows of images and actions (section 3.1.1).
+
+    Several cameras are one image of more channels to it. Its error is summed over them all, so that each camera adds
+    to the weight of the image against the KL.
 
     Args:
         rssm: Sizes and loss weights; its input sizes are filled from the dataset.
         window_length: Steps per training window T. A window starts at any frame from a zero state.
-        image_key: The camera to model; None takes the dataset's only camera.
         lr: Learning rate of Adam.
         grad_clip_norm: Joint gradient norm above which gradients are scaled down.
         dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in.
@@ -26,7 +30,6 @@ class WMRSSMConfig(PreTrainedConfig):
 
     rssm: RSSMConfig = field(default_factory=RSSMConfig)
     window_length: int = 25
-    image_key: str | None = None
     lr: float = 6e-4
     grad_clip_norm: float = 100.0
     dtype: str | None = None
@@ -61,23 +64,21 @@ class WMRSSMConfig(PreTrainedConfig):
         """Frames of a window, relative to its first."""
         return list(range(self.window_length))
 
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """The model's own size."""
+        return IMAGE_SIZE, IMAGE_SIZE
+
     def validate_features(self) -> None:
-        """Choose the camera and fill the model's input sizes from the dataset's features.
+        """Choose the cameras and fill the model's input sizes from the dataset's features.
 
         Raises:
-            ValueError: No camera or several, no action, or sizes unlike the checkpoint's.
+            ValueError: The cameras cannot be used, there is no action, or sizes are unlike the checkpoint's.
         """
-        cameras = image_keys(self.input_features)
-        if self.image_key is None and len(cameras) == 1:
-            self.image_key = cameras[0]
-        if self.image_key not in cameras:
-            raise ValueError(
-                f"wm_rssm models one camera; the dataset has {cameras or 'none'} and --policy.image_key is "
-                f"{self.image_key!r}. Set --policy.image_key to one of the dataset's cameras."
-            )
+        self.choose_cameras()
         sizes = {
             "action_dim": feature_dim(self.output_features, ACTION, "The dataset"),
-            "image_channels": self.input_features[self.image_key].shape[0],
+            "image_channels": self.image_shape[0],
         }
         if self.rssm.use_proprio:
             sizes["proprio_dim"] = feature_dim(self.input_features, OBS_STATE, "The dataset")

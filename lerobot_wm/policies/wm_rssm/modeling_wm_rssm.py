@@ -4,23 +4,14 @@ from typing import Any, NoReturn
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
-from lerobot_wm.nn.conv import IMAGE_SIZE
+from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.features import stat
 from lerobot_wm.policies.pretrained import StrictPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.world_model.model import WorldModel
-
-
-def resize_images(images: Tensor) -> Tensor:
-    """Bring images (..., C, H, W) in [0, 1] to the model's 64x64 by area averaging; 64x64 passes untouched."""
-    if images.shape[-2:] == (IMAGE_SIZE, IMAGE_SIZE):
-        return images
-    lead = images.shape[:-3]
-    flat = nn.functional.interpolate(images.flatten(0, -4), size=(IMAGE_SIZE, IMAGE_SIZE), mode="area")
-    return flat.unflatten(0, lead)
 
 
 class WMRSSMPolicy(StrictPolicy):
@@ -31,6 +22,7 @@ class WMRSSMPolicy(StrictPolicy):
 
     config_class = WMRSSMConfig
     name = "wm_rssm"
+    config: WMRSSMConfig
 
     def __init__(
         self,
@@ -60,7 +52,7 @@ class WMRSSMPolicy(StrictPolicy):
         """The world-model loss on a batch of windows.
 
         Args:
-            batch: The camera (B, T, C, H, W) in [0, 1], `action` (B, T, A), `action_is_pad` (B, T), and
+            batch: Each camera (B, T, C, H, W) in [0, 1], `action` (B, T, A), `action_is_pad` (B, T), and
                 `next.reward` (B, T), `observation.state` (B, T, P) where the configuration uses them.
 
         Returns:
@@ -68,7 +60,7 @@ class WMRSSMPolicy(StrictPolicy):
         """
         rssm = self.config.rssm
         loss, parts = self.world_model.loss(
-            images=resize_images(batch[self.config.image_key]),
+            images=camera_images(self.config, batch),
             actions=batch[ACTION],
             valid=~batch[f"{ACTION}_is_pad"],
             rewards=batch[REWARD] if rssm.predict_reward else None,

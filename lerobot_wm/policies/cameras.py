@@ -1,0 +1,118 @@
+"""The cameras of a policy: which it sees, and their images stacked along channels into one."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from torch import Tensor, nn
+
+from lerobot_wm.constants import OBS_IMAGE
+from lerobot_wm.policies.features import image_keys
+
+
+@dataclass
+class ImagePolicyConfig(PreTrainedConfig):
+    """A policy that sees one camera or several.
+
+    Args:
+        image_key: Its cameras, separated by commas: observation.images.corner2,observation.images.topview. Their images
+            are stacked in this order. None takes all cameras of the dataset, in its order.
+    """
+
+    image_key: str | None = None
+
+    @property
+    def cameras(self) -> list[str]:
+        """Feature keys of the cameras; none for a policy without images, or before `choose_cameras`."""
+        return self.image_key.split(",") if self.image_key else []
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(H, W) that the images of all cameras are brought to: the first camera's."""
+        _, height, width = self.input_features[self.cameras[0]].shape
+        return height, width
+
+    @property
+    def image_shape(self) -> tuple[int, int, int]:
+        """(C, H, W) of the stacked images."""
+        channels = sum(self.input_features[key].shape[0] for key in self.cameras)
+        return channels, *self.image_size
+
+    def choose_cameras(self) -> None:
+        """Check `image_key`, and take all cameras where it is None.
+
+        Raises:
+            ValueError: There is no camera, one is unknown or repeated, or they differ in their number of channels.
+        """
+        known = image_keys(self.input_features)
+        chosen = known if self.image_key is None else [key.strip() for key in self.image_key.split(",")]
+        if not chosen or not set(chosen) <= set(known) or len(set(chosen)) < len(chosen):
+            raise ValueError(
+                f"--policy.image_key is {self.image_key!r}; the dataset has the cameras {', '.join(known) or 'none'}. "
+                f"{self.type} sees one camera or several: set --policy.image_key to some of these, separated by "
+                "commas, each once."
+            )
+        channels = {key: self.input_features[key].shape[0] for key in chosen}
+        if len(set(channels.values())) > 1:
+            raise ValueError(
+                f"{self.type} sees cameras of one kind; their numbers of channels here are {channels}. Set "
+                "--policy.image_key to cameras that have equally many, separated by commas."
+            )
+        self.image_key = ",".join(chosen)
+
+
+def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
+    """Bring images (..., C, H, W) to a size (H, W) by area averaging; images of this size pass untouched."""
+    if images.shape[-2:] == size:
+        return images
+    flat = nn.functional.interpolate(images.flatten(0, -4), size=size, mode="area")
+    return flat.unflatten(0, images.shape[:-3])
+
+
+def stack_images(images: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+    """Resize each camera's images (..., C, H, W) and stack them along channels: (..., K·C, *size)."""
+    resized = [resize_images(image, size) for image in images]
+    return resized[0] if len(resized) == 1 else torch.cat(resized, dim=-3)  # which would copy a single one
+
+
+def camera_images(config: ImagePolicyConfig, batch: Mapping[str, Tensor]) -> Tensor:
+    """The images of a batch as the policy sees them.
+
+    Args:
+        config: Names the cameras.
+        batch: Each camera (..., C, H, W) in [0, 1].
+
+    Returns:
+        (..., K·C, H, W), the K cameras in their order.
+    """
+    return stack_images([batch[key] for key in config.cameras], config.image_size)
+
+
+def check_images(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:
+    """Check what a policy is shown at test time, each camera (B, C, H, W).
+
+    Raises:
+        ValueError: A camera is missing or has another size than in training.
+    """
+    for key in config.cameras:
+        expected = tuple(config.input_features[key].shape)
+        if key not in batch:
+            shown = [name for name in batch if name.startswith(OBS_IMAGE)]
+            raise ValueError(
+                f"This policy sees '{key}'; the observation has {', '.join(shown) or 'no image'}. Add the camera to "
+                "the robot or environment (--env.camera_name=corner2,topview for metaworld_mt), or give its name to "
+                "one that shows the same, by --rename_map."
+            )
+        found = tuple(batch[key].shape[1:])
+        if found != expected:
+            raise ValueError(
+                f"'{key}' is {found}, this policy was trained on {expected} (C, H, W): set the camera or environment "
+                f"to {expected[1]}x{expected[2]} (--env.image_size={expected[1]} for metaworld_mt)."
+            )
+
+
+def side_by_side(images: Tensor, n_cameras: int) -> Tensor:
+    """Stacked images (..., K·C, H, W) of K cameras as one wide picture each, to be looked at: (..., C, H, K·W)."""
+    return torch.cat(images.chunk(n_cameras, dim=-3), dim=-1)
