@@ -4,7 +4,11 @@ import difflib
 
 from lerobot_wm.constants import OBS_IMAGE, OBS_IMAGES
 
-CAMERAS = ("corner2", "corner", "corner3", "topview", "behindGripper", "gripperPOV")
+# Two cameras that Meta-World's models lack. They move with the hand and never turn, as if mounted on the wrist: what lies
+# at one offset from the hand is always at one place of the image. Camera -> azimuth and elevation (degrees), distance (m).
+HAND_CAMERAS = {"hand_top": (90.0, -89.9, 0.8), "hand_side": (180.0, -15.0, 0.8)}
+HAND_VIEW_CENTER = (0.0, 0.15, -0.05)  # metres from the hand: ahead of it, where its work is
+CAMERAS = ("corner2", "corner", "corner3", "topview", "behindGripper", "gripperPOV", *HAND_CAMERAS)
 # Mounted with their upper side down; what is drawn with them is turned by 180 degrees.
 UPSIDE_DOWN = frozenset({"corner", "corner2", "corner3"})
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lerobot_wm.envs.cameras import UPSIDE_DOWN
+from lerobot_wm.envs.cameras import HAND_CAMERAS, HAND_VIEW_CENTER, UPSIDE_DOWN
 
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco reads it when it is first imported
@@ -64,8 +64,13 @@ class Renderer:
             self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
             self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = model.camera(key.camera).id
+        self._follows_hand = key.camera in HAND_CAMERAS
+        if self._follows_hand:
+            self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+            self._camera.azimuth, self._camera.elevation, self._camera.distance = HAND_CAMERAS[key.camera]
+        else:
+            self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            self._camera.fixedcamid = model.camera(key.camera).id
         self._options = mujoco.MjvOption()
         self._viewport = mujoco.MjrRect(0, 0, key.size, key.size)
 
@@ -89,6 +94,8 @@ class Renderer:
         image = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
         # Every task's renderer has its own framebuffer in the one context: select ours.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        if self._follows_hand:
+            self._camera.lookat[:] = data.body("hand").xpos + HAND_VIEW_CENTER
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(model, data, self._options, None, self._camera, everything, self._scene)
         mujoco.mjr_render(self._viewport, self._scene, self._context)

@@ -102,3 +102,20 @@ def test_missing_gl_says_what_to_install() -> None:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
     assert result.returncode == 1
     assert "apt-get install -y --no-install-recommends libegl1 libgl1" in result.stderr.splitlines()[-2]
+
+
+@pytest.mark.parametrize("camera", ["hand_top", "hand_side"])
+def test_hand_cameras_move_with_the_hand(make_env: MakeEnv, camera: str) -> None:
+    env = make_env("reach-v3", camera_name=camera)
+    first = env.reset(seed=0)[0]
+    positions, hands = [], []
+    for _ in range(25):
+        observation = env.step(np.array([1.0, 1.0, 0.5, -1.0]))[0]
+        positions.append(np.array(env._renderers[camera]._scene.camera[0].pos))
+        hands.append(observation["agent_pos"][:3])
+    moved = np.array(hands[-1]) - hands[0]
+    assert np.linalg.norm(moved) > 0.1
+    np.testing.assert_allclose(
+        positions[-1] - positions[0], moved, atol=0.02
+    )  # the hand swings a little at the wrist
+    assert not np.array_equal(first["pixels"], observation["pixels"])
