@@ -4,8 +4,9 @@ import difflib
 
 from lerobot_wm.constants import OBS_IMAGE, OBS_IMAGES
 
-# Two cameras that Meta-World's models lack. They move with the hand and never turn, as if mounted on the wrist: what lies
-# at one offset from the hand is always at one place of the image. Camera -> azimuth and elevation (degrees), distance (m).
+# Two cameras that Meta-World's models lack. They move with the hand and never turn, as if mounted on the wrist: what
+# lies at one offset from the hand is always at one place of the image. Camera -> azimuth, elevation (degrees) and
+# distance (m).
 HAND_CAMERAS = {"hand_top": (90.0, -89.9, 0.8), "hand_side": (180.0, -15.0, 0.8)}
 HAND_VIEW_CENTER = (0.0, 0.15, -0.05)  # metres from the hand: ahead of it, where its work is
 CAMERAS = ("corner2", "corner", "corner3", "topview", "behindGripper", "gripperPOV", *HAND_CAMERAS)
