@@ -24,6 +24,7 @@ from lerobot_wm.pipeline.eval_config import EvaluateConfig
 from lerobot_wm.pipeline.expert import ExpertConfig
 from lerobot_wm.pipeline.init import InitConfig
 from lerobot_wm.pipeline.relabel import RelabelConfig
+from lerobot_wm.report import arms as report_arms
 from lerobot_wm.report.build import ReportConfig
 from lerobot_wm.report.quality import QualityConfig
 
@@ -212,3 +213,7 @@ def test_missing_settings_name_their_file(tmp_path: Path) -> None:
     arm = Arm("mine", config="no_such")
     with pytest.raises(FileNotFoundError, match=r"configs/cpu/no_such\.json"):
         plan(tmp_path).evaluations(arm, 0)
+
+
+def test_report_describes_every_arm() -> None:
+    assert set(report_arms.ARMS) == set(ARMS)

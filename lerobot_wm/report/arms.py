@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from lerobot_wm.report.records import Record
 
-# In the order of tables: the paper's six (its order), the tuned ones, then the controls.
+# In the order of tables: the paper's six (its order), then the controls.
 ARMS: dict[str, str] = {
     "e2e_iql": "IQL end to end from images, one policy for all tasks",
     "e2e_bc": "BC end to end from images, one policy for all tasks",
@@ -12,8 +12,6 @@ ARMS: dict[str, str] = {
     "e2e_bc_single": "BC end to end from images, one policy per task",
     "wm_iql": "IQL on latents of the world model, one policy for all tasks, β 0.5",
     "wm_bc": "BC on latents of the world model, one policy for all tasks",
-    "best_iql": "wm_iql with the settings of preset best",
-    "best_bc": "wm_bc with the settings of preset best",
     "e2e_iql_dense": "e2e_iql trained on the dense reward, as in the paper",
     "e2e_iql_single_dense": "e2e_iql_single trained on the dense reward, as in the paper",
     "wm_iql_single": "IQL on latents of the shared world model, one policy per task",
@@ -29,7 +27,7 @@ ARMS: dict[str, str] = {
     "expert": "the scripted expert itself, without noise",
 }
 # Each of these is compared with every other arm.
-COMPARED_ARMS = ("wm_iql", "wm_bc", "best_iql", "best_bc")
+COMPARED_ARMS = ("wm_iql", "wm_bc")
 DENSE_SUFFIX = "_dense"
 
 

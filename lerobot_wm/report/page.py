@@ -1,9 +1,6 @@
 """The HTML page: what it shows, and its template."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
-
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from lerobot_wm.report.arms import ARMS, by_arm
 from lerobot_wm.report.bootstrap import Estimate
@@ -22,6 +19,7 @@ from lerobot_wm.report.success import (
     task_table,
 )
 from lerobot_wm.report.tables import ReportTable, cell_text, present_splits
+from lerobot_wm.report.templates import template_environment
 from lerobot_wm.report.videos import MAX_VIDEO_BYTES, Clip, within_limit
 
 
@@ -50,13 +48,7 @@ class Page:
 
     def html(self) -> str:
         """One self-contained page: nothing is fetched when it is opened; its few lines of script play videos."""
-        environment = Environment(
-            loader=FileSystemLoader(Path(__file__).parent),
-            autoescape=True,
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
+        environment = template_environment()
         environment.tests["rate"] = lambda cell: isinstance(cell, SuccessRate | Estimate)
         environment.tests["counted"] = lambda cell: isinstance(cell, SuccessRate)
         environment.filters["text"] = cell_text

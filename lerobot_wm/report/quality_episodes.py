@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pandas as pd
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, SUCCESS, VARIATION
@@ -123,13 +123,8 @@ def filter_episodes(world_model: WorldModel, episodes: list[Episode]) -> list[Fi
         batch = episodes[begin : begin + _EPISODES_PER_BATCH]
         # The filter is causal: what pads the shorter episodes comes after their last frame.
         embeds = pad_sequence([_embed(world_model, episode, device) for episode in batch], batch_first=True)
-        actions = pad_sequence([episode.actions for episode in batch], batch_first=True).to(
-            device
-        )  # (B, T, A)
-        before = world_model.action_scaling(nn.functional.pad(actions[:, :-1], (0, 0, 1, 0)))  # a_{t-1}
-        start = world_model.rssm.initial_state(len(batch))
-        states, posterior = world_model.rssm.observe(embeds, before, start, sample=False)  # (B, T, ·)
-        kl = posterior.kl(world_model.rssm.prior(states.deter))  # (B, T)
+        actions = pad_sequence([episode.actions for episode in batch], batch_first=True)  # (B, T, A)
+        states, kl = world_model.filter_with_kl(embeds, actions.to(device))  # (B, T, ·), (B, T)
         for i, episode in enumerate(batch):
             steps = len(episode.actions)
             of_episode = RSSMState(states.deter[i, :steps].cpu(), states.stoch[i, :steps].cpu())

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from lerobot_wm.report.inline import PNG, SVG, data_uri, figure_bytes
 from lerobot_wm.report.quality_figures import EXAMPLE_HORIZON, EXAMPLES_NAME, quality_figures
+from lerobot_wm.report.templates import template_environment
 
 _ABSENT = "–"
 
@@ -48,13 +48,7 @@ def quality_section(path: Path) -> str:
                 f"{needed} is missing: expected the quality.json of `lerobot-wm quality` in its output folder."
             )
     result = json.loads(path.read_text())
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = template_environment()
     return environment.get_template("quality_section.html.j2").render(
         result,
         figures={

@@ -98,6 +98,12 @@ class WorldModel(nn.Module):
         state = self.rssm.initial_state(embeds.shape[0])
         return self.rssm.observe(embeds, self._shift(actions), state, sample=sample)[0]
 
+    def filter_with_kl(self, embeds: Tensor, actions: Tensor) -> tuple[RSSMState, Tensor]:
+        """`filter_embeds`, and how far each image moved the belief: KL(posterior || prior) in nats, (B, T)."""
+        state = self.rssm.initial_state(embeds.shape[0])
+        states, posterior = self.rssm.observe(embeds, self._shift(actions), state, sample=False)
+        return states, posterior.kl(self.rssm.prior(states.deter))
+
     def imagine(self, state: RSSMState, actions: Tensor, *, sample: bool = False) -> RSSMState:
         """Predict s_{t+1} ... s_{t+H} from s_t (B, ·) under actions a_t ... a_{t+H-1}, (B, H, A)."""
         return self.rssm.imagine(state, self.action_scaling(actions), sample=sample)
