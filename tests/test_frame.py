@@ -20,6 +20,7 @@ PACKAGE = ROOT / "lerobot_wm"
 # A part imports only parts of a lower level; parts of one level do not import each other.
 LEVELS = {
     "constants": 0,
+    "cores": 0,
     "nn": 1,
     "world_model": 2,
     "rl": 2,

@@ -15,6 +15,7 @@ from numpy.lib.format import open_memmap
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_wm.cores import usable_cores
 from lerobot_wm.data.fingerprint import dataset_fingerprint
 
 logger = logging.getLogger(__name__)
@@ -67,7 +68,7 @@ class CameraCache:
         missing = [episode for episode in episodes if not self._decoded[episode]]
         if not missing:
             return
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(usable_cores()) as pool:
             done = pool.map(self._decode, missing)
             list(tqdm(done, total=len(missing), desc=f"Decoding {self._key}", unit="episode", leave=False))
 

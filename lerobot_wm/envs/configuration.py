@@ -2,7 +2,6 @@
 
 import logging
 import multiprocessing
-import os
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -23,6 +22,7 @@ from lerobot_wm.constants import (
     REPORTED_VARIATION_SET,
     STATE_DIM,
 )
+from lerobot_wm.cores import usable_cores
 from lerobot_wm.envs.cameras import image_features, parse_cameras
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import split_variations
@@ -129,7 +129,7 @@ class MetaworldMTEnvConfig(EnvConfig):
         multiprocessing.get_context("forkserver").set_forkserver_preload(
             ["__main__", "lerobot.envs.utils", "metaworld", "lerobot_wm.envs.metaworld_mt"]
         )
-        cores = os.cpu_count() or 1
+        cores = usable_cores()
         if n_envs > cores:
             logging.warning(
                 "%d environment processes share %d cores: --eval.use_async_envs=false is likely faster.",

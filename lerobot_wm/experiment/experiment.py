@@ -1,6 +1,5 @@
 """Some arms and seeds of a preset: what is done, what is left, and doing it."""
 
-import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -10,6 +9,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from lerobot_wm.constants import REPORTED_VARIATION_SET
+from lerobot_wm.cores import usable_cores
 from lerobot_wm.experiment.arms import Arm
 from lerobot_wm.experiment.ledger import Ledger
 from lerobot_wm.experiment.plan import Plan
@@ -94,7 +94,7 @@ class Experiment:
             return Runner(
                 todo,
                 self.processes,
-                os.cpu_count() or 1,
+                usable_cores(),
                 self.times,
                 progress,
                 on_finish=lambda stage: self.settle(),
@@ -107,4 +107,4 @@ class Experiment:
         self.ledger.write()
         shutil.rmtree(self.report_dir, ignore_errors=True)  # cheap, so it always shows the records there are
         command = report_command(self.plan, self.runs, self.ledger.path, self.report_dir)
-        return subprocess.run(command, env=environment(os.cpu_count() or 1)).returncode == 0
+        return subprocess.run(command, env=environment(usable_cores())).returncode == 0

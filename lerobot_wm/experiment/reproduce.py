@@ -1,7 +1,6 @@
 """`scripts/reproduce_table1.py`: any arms and seeds of the experiment, from nothing to the table."""
 
 import argparse
-import os
 import signal
 import sys
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from lerobot_wm.constants import REPORTED_VARIATION_SET, VARIATION_SETS
+from lerobot_wm.cores import usable_cores
 from lerobot_wm.experiment.arms import ARMS
 from lerobot_wm.experiment.experiment import Experiment
 from lerobot_wm.experiment.lock import exclusive
@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--output_dir", type=Path, help="outputs/PRESET by default")
     parser.add_argument("--results_dir", type=Path, help="committed records; results/PRESET by default")
     parser.add_argument(
-        "--processes", type=int, default=os.cpu_count(), help="stages side by side (%(default)s)"
+        "--processes", type=int, default=usable_cores(), help="stages side by side (%(default)s)"
     )
     parser.add_argument(
         "--variation_set",

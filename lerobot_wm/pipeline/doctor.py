@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from lerobot_wm.constants import ENV_TYPE
+from lerobot_wm.cores import usable_cores
 
 DISTRIBUTION = "lerobot_policy_wm"
 MAIN_PACKAGES = ("lerobot", "torch", "metaworld", "mujoco")
@@ -159,7 +160,7 @@ def check_cpu() -> Check:
     cpuinfo = Path("/proc/cpuinfo")
     flags = cpuinfo.read_text().split() if cpuinfo.exists() else []
     bf16 = [flag for flag in ("amx_bf16", "avx512_bf16", "bf16") if flag in flags]
-    found = f"{os.cpu_count()} cores, {torch.get_num_threads()} PyTorch threads"
+    found = f"{usable_cores()} cores, {torch.get_num_threads()} PyTorch threads"
     return Check("CPU", f"{found}, native bfloat16: {bf16[0] if bf16 else 'no'}")
 
 

@@ -6,7 +6,6 @@ spread over processes, and every rollout leaves a line in a records file.
 
 import json
 import logging
-import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -19,6 +18,7 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 from tqdm import tqdm
 
+from lerobot_wm.cores import usable_cores
 from lerobot_wm.pipeline.eval_config import EvaluateConfig
 from lerobot_wm.pipeline.rollouts import TaskRunner, task_names
 from lerobot_wm.report.provenance import provenance
@@ -46,7 +46,7 @@ def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
         yield from map(TaskRunner(cfg).run, tasks)
         return
     workers = min(cfg.num_workers, len(tasks))
-    threads = max(1, (os.cpu_count() or 1) // workers)
+    threads = max(1, usable_cores() // workers)
     with ProcessPoolExecutor(
         workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=(cfg, threads)
     ) as pool:

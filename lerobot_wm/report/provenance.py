@@ -1,6 +1,5 @@
 """Where numbers come from: the command, the versions and the kind of machine."""
 
-import os
 import platform
 import shlex
 import sys
@@ -8,6 +7,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 import torch
+
+from lerobot_wm.cores import usable_cores
 
 PACKAGES = ("lerobot_policy_wm", "lerobot", "torch", "mujoco", "metaworld", "gymnasium", "numpy")
 
@@ -18,6 +19,6 @@ def provenance() -> dict[str, str]:
     facts = {"command": command, "python": platform.python_version()}
     facts |= {package: version(package) for package in PACKAGES}
     facts["system"] = f"{platform.system()} {platform.machine()}"
-    facts["CPU cores"] = str(os.cpu_count())
+    facts["CPU cores"] = str(usable_cores())
     facts["GPU"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return facts
