@@ -194,7 +194,9 @@ def probe_positions(frames: Frames) -> list[dict]:
 
 
 def probe_task(frames: Frames) -> list[dict]:
-    """Share of frames whose task a logistic regression tells, by representation."""
+    """Share of frames whose task a logistic regression tells, by representation; empty where there is one task."""
+    if len(set(frames.tasks)) == 1:
+        return []
     rows = []
     parts = splits(frames, np.arange(len(frames.tasks)))
     for name in REPRESENTATIONS:

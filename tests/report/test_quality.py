@@ -82,9 +82,13 @@ def test_by_cross_validation(
     assert "was not checked" in section.text
     assert "average precision" in section.text
 
+    assert "Task told by" in section.text
     result["reward"] = None  # as for a model without a reward head
+    result["task_probe"] = []  # as for a dataset of one task
     (out / "quality.json").write_text(json.dumps(result))
-    assert "average precision" not in Section(quality_section(out / "quality.json")).text
+    text = Section(quality_section(out / "quality.json")).text
+    assert "average precision" not in text
+    assert "Task told by" not in text
 
 
 def test_fitted_on_the_training_data(

@@ -119,6 +119,18 @@ def test_the_task_is_told_from_what_holds_it(frames: Frames) -> None:
     assert accuracy[UNTRAINED] < 0.65
 
 
+def test_one_task_needs_no_telling(frames: Frames) -> None:
+    rows = frames.tasks == "first"
+    first = Frames(
+        {name: x[rows] for name, x in frames.features.items()},
+        frames.env_state[rows],
+        frames.tasks[rows],
+        frames.variations[rows],
+        to_fit=None,
+    )
+    assert probe_task(first) == []
+
+
 def test_frames_of_real_episodes(demos_root: Path, world_model_path: Path) -> None:
     world_model = load_world_model(str(world_model_path)).world_model
     episodes = read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=2, seed=0)
