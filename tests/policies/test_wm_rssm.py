@@ -3,12 +3,16 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 
+from lerobot_wm.data.loader import RamDataset
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
@@ -109,3 +113,65 @@ def test_broken_checkpoints_are_refused(world_model_path: Path, tmp_path: Path, 
         weights.write_bytes(weights.read_bytes()[:1000])
     with pytest.raises(ValueError, match="NaN or Inf" if fault == "NaN" else "does not fit"):
         WMRSSMPolicy.from_pretrained(broken)
+
+
+def test_episodes_shorter_than_a_window_are_trained_on(
+    tmp_path: Path, lerobot_wm_command: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sampler that kept every window of 6 within its episode would leave out the first one as a whole."""
+    image = {"dtype": "image", "shape": (64, 64, 3), "names": ["height", "width", "channels"]}
+    action = {"dtype": "float32", "shape": (2,), "names": ["x", "y"]}
+    dataset = LeRobotDataset.create(
+        "test/short",
+        10,
+        {"observation.image": image, "action": action},
+        root=tmp_path / "dataset",
+        use_videos=False,
+    )
+    rng = np.random.default_rng(0)
+    for length in (3, 10, 6):
+        for _ in range(length):
+            frame = {
+                "observation.image": rng.integers(0, 255, (64, 64, 3), dtype=np.uint8),
+                "action": rng.random(2, dtype=np.float32),
+                "task": "wave",
+            }
+            dataset.add_frame(frame)
+        dataset.save_episode()
+    dataset.finalize()
+
+    drawn: list[int] = []
+    batch = RamDataset.batch
+
+    def noting_rows(self: RamDataset, rows: list[int]) -> dict[str, Any]:
+        drawn.extend(rows)
+        return batch(self, rows)
+
+    monkeypatch.setattr(RamDataset, "batch", noting_rows)
+    lerobot_wm_command(  # one epoch in one step
+        "train --policy.type=wm_rssm --steps=1 --batch_size=13 --policy.window_length=6 --log_freq=1",
+        f"{TRAIN_FLAGS} --dataset.repo_id=test/short --dataset.root={tmp_path / 'dataset'}",
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    assert sorted(drawn) == [0, *range(3, 11), *range(13, 17)]
+    log = json.loads((tmp_path / "run" / "train_log.jsonl").read_text())
+    assert np.isfinite(log["loss"])
+
+
+def test_what_pads_a_window_counts_for_nothing(world_model_path: Path) -> None:
+    policy = WMRSSMPolicy.from_pretrained(world_model_path).train()
+    generator = torch.Generator().manual_seed(0)
+    batch = {
+        "observation.image": torch.rand(2, 5, 3, 64, 64, generator=generator),
+        "action": torch.rand(2, 5, 4, generator=generator),
+        "next.reward": torch.rand(2, 5, generator=generator),
+        "action_is_pad": torch.tensor([[False] * 5, [False, False, True, True, True]]),
+    }
+    padded = {key: value.clone() for key, value in batch.items()}
+    for key in ("observation.image", "action", "next.reward"):
+        padded[key][1, 2:] = 0.5
+    losses = []
+    for each in (batch, padded):
+        torch.manual_seed(0)
+        losses.append(policy.forward(each)[0].item())
+    assert losses[0] == losses[1]

@@ -43,11 +43,15 @@ class WMRSSMConfig(ImagePolicyConfig):
             raise ValueError(f"window_length is {self.window_length}; a window needs at least 2 steps.")
         if self.dtype is None:
             self.dtype = default_dtype(str(self.device))
+        self.drop_n_last_frames = self.window_length - 1  # no setting: read by LeRobot's sampler
 
-    @property
-    def drop_n_last_frames(self) -> int:
-        """LeRobot's sampler leaves these out, so that every training window lies within its episode."""
-        return self.window_length - 1
+    def fit_windows(self, shortest_episode: int) -> None:
+        """Have LeRobot's sampler start windows in every episode, however short.
+
+        It leaves out the last frames of each: as many as keep windows within their episodes, or fewer where the
+        shortest is shorter than a window. Then windows run past the end of the others too; padding counts for nothing.
+        """
+        self.drop_n_last_frames = min(self.window_length, shortest_episode) - 1
 
     @property
     def observation_delta_indices(self) -> list[int]:
