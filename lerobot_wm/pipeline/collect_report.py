@@ -3,7 +3,6 @@
 import json
 from collections import Counter, defaultdict
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from lerobot_wm.envs.tasks import expert_name
-from lerobot_wm.pipeline.collect_shards import ShardRecord
+from lerobot_wm.pipeline.collect_record import ShardRecord
+from lerobot_wm.pipeline.collect_shards import versions
 
 COLLECTION_RECORD = Path("meta", "collection.json")
-
-
-def versions() -> dict[str, str]:
-    """Versions of what a trajectory depends on; mujoco's change its fourth decimal."""
-    return {name: version(name) for name in ("mujoco", "metaworld", "lerobot", "lerobot_policy_wm")}
 
 
 def write_collection_record(

@@ -1,7 +1,7 @@
 """The unit of work of a collection: a shard of a few episodes, its own finished LeRobotDataset.
 
 Which episodes a shard holds is a function of the configuration alone, and an episode's noise of its task,
-variation, number and attempt. So neither the number of workers nor an interruption changes the result.
+variation, number and attempt. So neither the number of workers or jobs nor an interruption changes the result.
 """
 
 import json
@@ -9,11 +9,12 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from lerobot.configs.video import RGBEncoderConfig
-from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import FPS, MAX_EPISODE_STEPS, ROBOT_TYPE
@@ -23,9 +24,9 @@ from lerobot_wm.envs.rendering import Renderer, RenderKey
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import task_id
 from lerobot_wm.pipeline.collect_episode import Demonstration, dataset_frames, demonstrate
+from lerobot_wm.pipeline.collect_record import SHARD_RECORD, EpisodeRecord, ShardRecord, file_sizes
 
 SHARD_EPISODES = 13  # some ten seconds of work: what a killed worker has to redo
-SHARD_RECORD = "shard.json"
 TEMPORARY_PREFIX = "unfinished-"
 
 
@@ -50,47 +51,14 @@ class Shard:
         """Folder name."""
         return f"{self.task}-{self.first:05d}"
 
-
-@dataclass
-class EpisodeRecord:
-    """How an episode came about.
-
-    Args:
-        task: its task.
-        episode: its number within the task.
-        variation: the one it was collected on.
-        moved: whether that is another than planned, the expert having failed there.
-        attempt: failures on this variation before it.
-        seed: entropy of the noise's np.random.SeedSequence.
-        length: frames.
-    """
-
-    task: str
-    episode: int
-    variation: int
-    moved: bool
-    attempt: int
-    seed: list[int]
-    length: int
+    def made_of(self) -> dict[str, Any]:
+        """All that its content depends on, the versions of packages too."""
+        return {**asdict(self), "versions": versions()}
 
 
-@dataclass
-class ShardRecord:
-    """A finished shard's episodes, its failed attempts per variation, and its wall time in seconds."""
-
-    episodes: list[EpisodeRecord]
-    failures: dict[int, int]
-    seconds: float
-
-    @classmethod
-    def load(cls, folder: Path) -> "ShardRecord":
-        """Read the record that lies in a finished shard."""
-        data = json.loads((folder / SHARD_RECORD).read_text())
-        return cls(
-            episodes=[EpisodeRecord(**episode) for episode in data["episodes"]],
-            failures={int(variation): count for variation, count in data["failures"].items()},
-            seconds=data["seconds"],
-        )
+def versions() -> dict[str, str]:
+    """Versions of what a trajectory depends on; mujoco's change its fourth decimal."""
+    return {name: version(name) for name in ("mujoco", "metaworld", "lerobot", "lerobot_policy_wm")}
 
 
 def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> None:
@@ -105,7 +73,7 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
         RuntimeError: if the expert fails an episode on every variation, `max_attempts` times each.
     """
     start = time.monotonic()
-    temporary = folder / f"{TEMPORARY_PREFIX}{os.getpid()}-{shard.name}"
+    temporary = folder / f"{TEMPORARY_PREFIX}{shard.name}-{os.getpid()}"
     dataset = _create_dataset(temporary, shard)
     simulation = Simulation(shard.task, shard.variation_set)
     render_keys = {
@@ -113,7 +81,7 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
         for camera, feature in image_features(shard.cameras).items()
     }
     renderers = {feature: Renderer.acquire(key, simulation.model) for feature, key in render_keys.items()}
-    record = ShardRecord(episodes=[], failures={}, seconds=0.0)
+    record = ShardRecord(made_of=shard.made_of(), episodes=[], failures={}, seconds=0.0, files={})
     for episode in range(shard.first, shard.first + shard.count):
         demonstration = _succeed(shard, episode, simulation, record)
         for frame in dataset_frames(demonstration, simulation, renderers):
@@ -124,6 +92,7 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
     for key in render_keys.values():
         Renderer.release(key)
     record.seconds = time.monotonic() - start
+    record.files = file_sizes(temporary)
     (temporary / SHARD_RECORD).write_text(json.dumps(asdict(record)))
     temporary.rename(folder / shard.name)
 
@@ -151,23 +120,9 @@ def _succeed(shard: Shard, episode: int, simulation: Simulation, record: ShardRe
     )
 
 
-def merge_shards(shards: list[Shard], folder: Path, repo_id: str, root: Path) -> None:
-    """Merge finished shards, in their order, into one LeRobotDataset at `root`."""
-    aggregate_datasets(
-        repo_ids=[_shard_repo_id(shard) for shard in shards],
-        roots=[folder / shard.name for shard in shards],
-        aggr_repo_id=repo_id,
-        aggr_root=root,
-    )
-
-
-def _shard_repo_id(shard: Shard) -> str:
-    return f"shards/{shard.name}"
-
-
 def _create_dataset(root: Path, shard: Shard) -> LeRobotDataset:
     return LeRobotDataset.create(
-        repo_id=_shard_repo_id(shard),
+        repo_id=f"shards/{shard.name}",
         root=root,
         fps=FPS,
         robot_type=ROBOT_TYPE,

@@ -9,22 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
-import numpy as np
-import torch
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_tools import modify_features
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.device_utils import auto_select_torch_device
-from tqdm import tqdm
 
 from lerobot_wm.constants import OBS_LATENT, OBS_STATE
 from lerobot_wm.data.cache import cache_root
 from lerobot_wm.data.fingerprint import dataset_fingerprint, weights_fingerprint
 from lerobot_wm.data.latents import LatentRecord
-from lerobot_wm.pipeline.encode_episodes import filter_episodes
+from lerobot_wm.pipeline.encode_episodes import episode_batches
+from lerobot_wm.pipeline.encode_parts import LatentParts
 from lerobot_wm.pipeline.quiet import quiet
+from lerobot_wm.pipeline.share import Share
 from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.policies.frozen_encoder import EncoderPolicy, load_encoder
 
@@ -43,6 +42,10 @@ class EncodeConfig:
         sample: Store a sample of z_t instead of its mean.
         seed: Seed of the samples.
         device: Where to run the world model; None picks the fastest there is.
+        shard: Of several jobs, the one this is: 1/4 is the first of four. Each job encodes its share of the episodes
+            into `<output_root>.parts`; when all are in one such folder, the same command without this flag makes the
+            dataset of them. Where machines share a disk, set LEROBOT_WM_CACHE to a folder of its own for each: they
+            must not decode frames into one file.
         push_to_hub: Upload the result as `output_repo_id`.
     """
 
@@ -53,6 +56,7 @@ class EncodeConfig:
     sample: bool = False
     seed: int = 0
     device: str | None = None
+    shard: str | None = None
     push_to_hub: bool = False
 
 
@@ -62,27 +66,73 @@ def encode(
     output_repo_id: str,
     output_root: Path,
     *,
-    sample: bool = False,
+    sample_seed: int | None = None,
 ) -> LeRobotDataset:
     """Write a copy of `source` with `observation.latent` (L,) in place of its cameras.
 
-    The copy records which world model made it (`meta/latents.json`). It is written beside `output_root` and
-    moved there when whole: what lies there is complete.
+    The copy records which world model made it (`meta/latents.json`). Latents are gathered in `<output_root>.parts`,
+    which may hold some already: of a run that was killed, or of jobs (`encode_share`). The copy is written beside
+    `output_root` and moved there when whole: what lies there is complete.
 
     Args:
         policy: The frozen world model.
         source: The image dataset, all of its episodes.
         output_repo_id: Repository id of the result.
         output_root: Folder of the result.
-        sample: Store a sample of z_t instead of its mean.
+        sample_seed: Store a sample of z_t, drawn with this seed, instead of its mean.
 
     Returns:
         The latent dataset.
 
     Raises:
-        FileExistsError: `output_root` is there already.
+        FileExistsError: `output_root` is there already, or `<output_root>.parts` holds other latents.
         ValueError: The dataset lacks a camera of the world model or proprioception, or latents are not finite.
     """
+    record, parts = _begin(policy, source, output_root, sample_seed)
+    batches = episode_batches(source)
+    parts.complete(policy, source, batches, sample_seed)
+    latents = parts.read(batches).numpy()  # (N, L), in the dataset's order
+    partial = output_root.with_name(f"{output_root.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    with quiet():
+        feature = {"dtype": "float32", "shape": latents.shape[1:], "names": None}
+        encoded = modify_features(
+            source, {OBS_LATENT: (latents, feature)}, source.meta.camera_keys, partial, output_repo_id
+        )
+    stats = get_feature_stats(latents, axis=0, keepdims=False)  # modify_features leaves new features out
+    write_stats({**encoded.meta.stats, OBS_LATENT: stats}, partial)
+    record.write(partial)
+    partial.replace(output_root)
+    shutil.rmtree(parts.folder)
+    return LeRobotDataset(output_repo_id, root=output_root)
+
+
+def encode_share(
+    policy: EncoderPolicy,
+    source: LeRobotDataset,
+    output_root: Path,
+    share: Share,
+    *,
+    sample_seed: int | None = None,
+) -> None:
+    """One job's share of the latents, in `<output_root>.parts`; `encode` turns those of all jobs into a dataset.
+
+    Raises what `encode` does, and ValueError where there are more jobs than batches.
+    """
+    _, parts = _begin(policy, source, output_root, sample_seed)
+    batches = episode_batches(source)
+    parts.complete(policy, source, share.of(batches), sample_seed)
+    there = len(batches) - len(parts.missing(batches))
+    print(
+        f"Job {share.index}/{share.count} is done: {there} of {len(batches)} batches are in {parts.folder}. "
+        "When all are there, the same command without --shard makes the dataset of them."
+    )
+
+
+def _begin(
+    policy: EncoderPolicy, source: LeRobotDataset, output_root: Path, sample_seed: int | None
+) -> tuple[LatentRecord, LatentParts]:
+    """Refuse what cannot be encoded; the record of the result, and the place of its latents."""
     if output_root.exists():
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
     missing = [key for key in policy.config.cameras if key not in source.meta.camera_keys]
@@ -95,33 +145,19 @@ def encode(
         raise ValueError(
             f"{source.repo_id} has no '{OBS_STATE}', which every policy on latents reads beside them."
         )
-    episodes = filter_episodes(policy, source, sample=sample)
-    progress = tqdm(episodes, total=source.num_episodes, desc="Encoding", unit="episode")
-    latents = torch.cat(list(progress)).numpy()  # (N, L), in the dataset's order
-    if not np.isfinite(latents).all():
-        row = int(np.isfinite(latents).all(axis=1).argmin())
-        raise ValueError(
-            f"The world model's latents are not finite from frame {row} of {source.repo_id} on: "
-            "its weights or the actions there are broken."
-        )
-    partial = output_root.with_name(f"{output_root.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    with quiet():
-        feature = {"dtype": "float32", "shape": latents.shape[1:], "names": None}
-        encoded = modify_features(
-            source, {OBS_LATENT: (latents, feature)}, source.meta.camera_keys, partial, output_repo_id
-        )
-    stats = get_feature_stats(latents, axis=0, keepdims=False)  # modify_features leaves new features out
-    write_stats({**encoded.meta.stats, OBS_LATENT: stats}, partial)
-    LatentRecord(
+    record = LatentRecord(
         world_model_fingerprint=weights_fingerprint(policy.world_model),
         source_repo_id=source.repo_id,
         source_fingerprint=dataset_fingerprint(Path(source.root)),
         tasks=[str(task) for task in source.meta.tasks.index],
-        sampled=sample,
-    ).write(partial)
-    partial.replace(output_root)
-    return LeRobotDataset(output_repo_id, root=output_root)
+        sampled=sample_seed is not None,
+    )
+    made_of = {
+        "world_model_fingerprint": record.world_model_fingerprint,
+        "source_fingerprint": record.source_fingerprint,
+        "sample_seed": str(sample_seed),
+    }
+    return record, LatentParts(output_root.with_name(f"{output_root.name}.parts"), made_of)
 
 
 def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMetadata, device: str) -> Path:
@@ -152,10 +188,15 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
 def main() -> None:
     """Entry point of `lerobot-wm encode`."""
     cfg = draccus.parse(EncodeConfig)
-    torch.manual_seed(cfg.seed)
+    share = Share.parse(cfg.shard) if cfg.shard else None
     policy = load_encoder(cfg.world_model_path)
     policy.to(cfg.device or auto_select_torch_device())
-    dataset = encode(policy, cfg.dataset.open(), cfg.output_repo_id, cfg.output_root, sample=cfg.sample)
+    source = cfg.dataset.open()
+    sample_seed = cfg.seed if cfg.sample else None
+    if share is not None:
+        encode_share(policy, source, cfg.output_root, share, sample_seed=sample_seed)
+        return
+    dataset = encode(policy, source, cfg.output_repo_id, cfg.output_root, sample_seed=sample_seed)
     print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames -> {cfg.output_root}")
     if cfg.push_to_hub:
         dataset.push_to_hub(tags=["lerobot_wm", "latents"])

@@ -1,7 +1,8 @@
-"""Whole episodes through a frozen encoder, a few at a time."""
+"""Whole episodes through a frozen encoder, a batch of a few at a time."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
@@ -17,52 +18,69 @@ _EPISODES_PER_BATCH = 16
 _FRAMES_PER_CHUNK = 512  # images per encoder call: bounds memory whatever the length of the episodes
 
 
+def episode_batches(dataset: LeRobotDataset) -> list[range]:
+    """The batches in which a dataset's episodes are encoded. They change its latents' last bits, so they are fixed."""
+    total = dataset.meta.total_episodes
+    return [range(i, min(i + _EPISODES_PER_BATCH, total)) for i in range(0, total, _EPISODES_PER_BATCH)]
+
+
 @torch.no_grad()
-def filter_episodes(
-    policy: EncoderPolicy, dataset: LeRobotDataset, *, sample: bool = False
+def filter_batches(
+    policy: EncoderPolicy, source: LeRobotDataset, batches: Sequence[range], *, sample_seed: int | None = None
 ) -> Iterator[Tensor]:
-    """Latents of every episode of `dataset`, a few episodes at a time.
+    """Latents of some batches of a dataset's episodes; no other episode's images are decoded.
 
     Args:
         policy: The world model, on the device it shall run on.
-        dataset: The image dataset it filters.
-        sample: Draw z_t instead of taking its mean.
+        source: The image dataset it filters.
+        batches: Some of its `episode_batches`, in their order.
+        sample_seed: Draw z_t, with this seed, instead of taking its mean.
 
     Yields:
-        For each episode in order, s_t for its frames: (T, L) float32 on the CPU.
+        For each batch, s_t for the frames of its episodes: (N, L) float32 on the CPU.
     """
     policy.eval()
     world_model, image_size = policy.world_model, policy.config.image_size
     device = next(world_model.parameters()).device
+    episodes = [episode for batch in batches for episode in batch]
+    dataset = LeRobotDataset(source.repo_id, source.root, episodes, revision=source.revision)
     # Of each camera (N, H, W, C) uint8, by absolute index.
     cameras = [camera_frames(dataset, key) for key in policy.config.cameras]
-    columns = {
-        key: column_tensor(dataset.hf_dataset, key, tuple(dataset.meta.features[key]["shape"]))
-        for key in ("episode_index", "index", ACTION, OBS_STATE)
-    }
-    _, lengths = torch.unique_consecutive(columns["episode_index"], return_counts=True)
-    stops = lengths.cumsum(0).tolist()
-    episodes = [slice(stop - length, stop) for stop, length in zip(stops, lengths.tolist(), strict=True)]
-
-    for begin in range(0, len(episodes), _EPISODES_PER_BATCH):
-        batch = episodes[begin : begin + _EPISODES_PER_BATCH]
+    all_lengths = source.meta.episodes["length"][:]
+    lengths = [all_lengths[episode] for episode in episodes]
+    # Of each episode, its rows of a column.
+    index, actions, proprio = (
+        dict(zip(episodes, _column(dataset, key).split(lengths), strict=True))
+        for key in ("index", ACTION, OBS_STATE)
+    )
+    for batch in batches:
         embeds = []
-        for rows in batch:
-            index = columns["index"][rows].split(_FRAMES_PER_CHUNK)
-            proprio = columns[OBS_STATE][rows].to(device).split(_FRAMES_PER_CHUNK)
+        for episode in batch:
             chunks = [
                 world_model.embed(
                     stack_images([_images(frames[i].to(device)) for frames in cameras], image_size)[None],
                     p[None],
                 )[0]
-                for i, p in zip(index, proprio, strict=True)
+                for i, p in zip(
+                    index[episode].split(_FRAMES_PER_CHUNK),
+                    proprio[episode].to(device).split(_FRAMES_PER_CHUNK),
+                    strict=True,
+                )
             ]
             embeds.append(torch.cat(chunks))  # (T, E)
         # The filter is causal: what pads the shorter episodes comes after their last frame.
-        actions = pad_sequence([columns[ACTION][rows] for rows in batch], batch_first=True).to(device)
-        states = world_model.filter_embeds(pad_sequence(embeds, batch_first=True), actions, sample=sample)
-        for rows, latents in zip(batch, states.latent.cpu(), strict=True):
-            yield latents[: rows.stop - rows.start]
+        padded_embeds = pad_sequence(embeds, batch_first=True)  # (B, T, E)
+        padded_actions = pad_sequence([actions[episode] for episode in batch], batch_first=True).to(device)
+        if sample_seed is not None:  # a batch's own: the same whoever encodes it, and after whatever
+            [seed] = np.random.SeedSequence([sample_seed, batch.start]).generate_state(1)
+            torch.manual_seed(int(seed))
+        states = world_model.filter_embeds(padded_embeds, padded_actions, sample=sample_seed is not None)
+        latents = states.latent.cpu()  # (B, T, L)
+        yield torch.cat([latents[i, : len(embed)] for i, embed in enumerate(embeds)])
+
+
+def _column(dataset: LeRobotDataset, key: str) -> Tensor:
+    return column_tensor(dataset.hf_dataset, key, tuple(dataset.meta.features[key]["shape"]))
 
 
 def _images(frames: Tensor) -> Tensor:
