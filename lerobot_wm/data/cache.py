@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -53,6 +54,7 @@ class CameraCache:
     def __init__(self, dataset: LeRobotDataset, key: str, folder: Path) -> None:
         self._dataset = dataset
         self._key = key
+        self._folder = folder
         height, width, channels = self._frame_shape()
         shape = (dataset.meta.total_frames, height, width, channels)
         self._frames = self._open(folder / f"{key}.npy", shape)
@@ -64,13 +66,29 @@ class CameraCache:
         return self._frames
 
     def ensure(self, episodes: Iterable[int]) -> None:
-        """Decode the episodes that are not in the cache yet, on all cores."""
+        """Decode the episodes that are not in the cache yet, on all cores.
+
+        Raises:
+            OSError: Their frames do not fit on the disk.
+        """
         missing = [episode for episode in episodes if not self._decoded[episode]]
         if not missing:
             return
+        self._check_room(missing)
         with ThreadPoolExecutor(usable_cores()) as pool:
             done = pool.map(self._decode, missing)
             list(tqdm(done, total=len(missing), desc=f"Decoding {self._key}", unit="episode", leave=False))
+
+    def _check_room(self, episodes: list[int]) -> None:
+        # A write through a memory map that finds the disk full does not raise: it kills the process.
+        lengths = self._dataset.meta.episodes["length"][:]
+        needed = sum(lengths[episode] for episode in episodes) * self._frames[0].nbytes
+        free = shutil.disk_usage(self._folder).free
+        if needed > free:
+            raise OSError(
+                f"The decoded frames of {self._key} take {needed / 1e9:.1f} GB, and {self._folder} has "
+                f"{free / 1e9:.1f} GB free: make room there, or set {CACHE_VARIABLE} to a folder on a larger disk."
+            )
 
     def _decode(self, episode: int) -> None:
         meta = self._dataset.meta

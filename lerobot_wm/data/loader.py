@@ -1,6 +1,6 @@
 """Batches equal to LeRobot's DataLoader, gathered from RAM or GPU memory."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -34,12 +34,15 @@ class RamDataset:
     Args:
         dataset: The dataset, with the delta indices it was opened with.
         device: Frames are kept here when they fit, else in a memory map; the columns always are.
+        cameras: Those to decode and serve; None for all.
 
     Raises:
         ValueError: The dataset applies image transforms, which decoded frames do not go through.
     """
 
-    def __init__(self, dataset: LeRobotDataset, device: torch.device) -> None:
+    def __init__(
+        self, dataset: LeRobotDataset, device: torch.device, cameras: Collection[str] | None = None
+    ) -> None:
         if dataset.reader._image_transforms is not None:
             raise ValueError(
                 "--dataset.image_transforms.enable=true has no effect on frames served from RAM: "
@@ -57,7 +60,11 @@ class RamDataset:
         }
         # PNG frames leave LeRobot's loader as float32, video frames as uint8 for the training loop to convert.
         self._float_cameras = set(meta.image_keys)
-        self._cameras = {key: self._resident(camera_frames(dataset, key)) for key in meta.camera_keys}
+        self._cameras = {
+            key: self._resident(camera_frames(dataset, key))
+            for key in meta.camera_keys
+            if cameras is None or key in cameras
+        }
 
         episode = self._columns["episode_index"]
         starts = torch.searchsorted(episode, episode)  # rows of an episode are consecutive
@@ -66,7 +73,7 @@ class RamDataset:
         self._to_absolute = self._columns["index"] - torch.arange(len(episode), device=device)  # (N,)
 
     def batch(self, rows: list[int]) -> dict[str, Any]:
-        """The collated batch of these dataset indices: the keys, shapes, types and values of LeRobot's."""
+        """The collated batch of these dataset indices: LeRobot's keys, shapes, types and values."""
         index = torch.tensor(rows, device=self.device)  # (B,)
         windows: dict[tuple[int, ...], tuple[Tensor, Tensor]] = {}
         out: dict[str, Any] = {}
@@ -112,17 +119,22 @@ class RamLoader:
         data_loader: The loader LeRobot built; its batch sampler gives the order, its dataset the frames.
         batch_sampler: What to iterate in its place, e.g. this process's share of it.
         device: Where batches are put.
+        cameras: Those to serve; None for all.
     """
 
     def __init__(
-        self, data_loader: DataLoader, batch_sampler: Iterable[list[int]], device: torch.device
+        self,
+        data_loader: DataLoader,
+        batch_sampler: Iterable[list[int]],
+        device: torch.device,
+        cameras: Collection[str] | None = None,
     ) -> None:
         dataset: Any = data_loader.dataset
         self._subset: Sequence[int] | None = None
         if isinstance(dataset, Subset):  # LeRobot's --max_eval_samples
             dataset, self._subset = dataset.dataset, dataset.indices
         self._batch_sampler = batch_sampler
-        self._source = RamDataset(dataset, device)
+        self._source = RamDataset(dataset, device, cameras)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for rows in self._batch_sampler:

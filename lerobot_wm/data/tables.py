@@ -18,18 +18,23 @@ def column_tensor(dataset: Dataset, key: str, shape: tuple[int, ...]) -> Tensor:
     Returns:
         (N, *shape): float32 for any float, int64 for any integer, bool for booleans.
     """
-    array = dataset.data.table.column(key).combine_chunks()
+    column = dataset.data.table.column(key)
     if dataset._indices is not None:
-        array = array.take(dataset._indices.column(0).combine_chunks())
+        column = column.take(dataset._indices.column(0))
+    # Arrow maps the table from its file: joining the chunks is the one copy of a float32 or int64 column.
+    values = np.concatenate([_flat_values(chunk) for chunk in column.chunks])  # (N * prod(shape),)
+    if values.dtype != bool:
+        values = values.astype(
+            np.int64 if np.issubdtype(values.dtype, np.integer) else np.float32, copy=False
+        )
+    tensor = torch.from_numpy(values)
+    return tensor if shape == (1,) else tensor.reshape(-1, *shape)
+
+
+def _flat_values(array: pa.Array) -> np.ndarray:
+    """The numbers of a column's chunk in order, without the lists they are stored in."""
     if isinstance(array, pa.ExtensionArray):
         array = array.storage
     while pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type):
         array = array.flatten()
-    values = array.to_numpy(zero_copy_only=False)
-    if values.dtype == bool:
-        tensor = torch.from_numpy(values.copy())
-    elif np.issubdtype(values.dtype, np.integer):
-        tensor = torch.from_numpy(values.astype(np.int64))
-    else:
-        tensor = torch.from_numpy(values.astype(np.float32))
-    return tensor if shape == (1,) else tensor.reshape(-1, *shape)
+    return array.to_numpy(zero_copy_only=False)

@@ -2,12 +2,16 @@
 
 import json
 import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from accelerate import Accelerator, DistributedDataParallelKwargs
+from accelerate import Accelerator, DistributedDataParallelKwargs, InitProcessGroupKwargs
 from accelerate.data_loader import BatchSamplerShard
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.scripts.lerobot_train import train as lerobot_train
@@ -17,21 +21,51 @@ from lerobot.utils.logging_utils import MetricsTracker
 from lerobot_wm.constants import OBS_LATENT
 from lerobot_wm.data.loader import RamLoader
 from lerobot_wm.pipeline.encode import encode_to_cache
+from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
 TRAIN_LOG_NAME = "train_log.jsonl"
 
+# How long processes wait for the one that decodes or encodes; by default they give up after minutes.
+_PATIENCE = timedelta(days=1)
+
 
 class RamAccelerator(Accelerator):
-    """An Accelerator whose data loaders serve LeRobot's batches from memory; everything else is accelerate's."""
+    """An Accelerator whose data loaders serve LeRobot's batches from memory; everything else is accelerate's.
+
+    Args:
+        train_config: Of the run: names the policy, whose cameras alone are served.
+        **kwargs: accelerate's own.
+    """
+
+    def __init__(self, train_config: TrainPipelineConfig, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self._train_config = train_config
 
     def prepare_data_loader(self, data_loader: Any, *args: Any, **kwargs: Any) -> RamLoader:
-        """Replace the loader by one that reads the same samples, this process's share of them, from memory."""
+        """Replace the loader by one that reads the same samples, this process's share of them, from memory.
+
+        Step k of W processes reads batches kW to kW + W - 1 of the epoch, one each: together the batch of one process
+        with a W times larger batch size. An epoch's last step is filled up with the epoch's first samples.
+        """
         batch_sampler = data_loader.batch_sampler
         if self.num_processes > 1:
             batch_sampler = BatchSamplerShard(batch_sampler, self.num_processes, self.process_index)
-        with self.main_process_first():  # the first decodes the frames, the others map them
-            return RamLoader(data_loader, batch_sampler, self.device)
+        with self.in_turn():  # the first decodes the frames, the others map them
+            return RamLoader(data_loader, batch_sampler, self.device, cameras_to_serve(self._train_config))
+
+    @contextmanager
+    def in_turn(self) -> Iterator[None]:
+        """Let one process make files that the others then find there.
+
+        The main process goes first, then the first of each other host, whose disk may be its own, then the rest.
+        """
+        turn = 0 if self.is_main_process else 1 if self.is_local_main_process else 2
+        for _ in range(turn):
+            self.wait_for_everyone()
+        yield
+        for _ in range(turn, 2):
+            self.wait_for_everyone()
 
 
 class TrainLog(logging.Filter):
@@ -53,16 +87,42 @@ class TrainLog(logging.Filter):
         return True
 
 
-def make_accelerator(policy: PreTrainedConfig) -> RamAccelerator:
-    """The Accelerator LeRobot's train() would make for this policy, with our loaders."""
+def cameras_to_serve(cfg: TrainPipelineConfig) -> set[str] | None:
+    """The dataset's cameras that the policy looks at, where it is one of ours; None, all of them, where it is not."""
+    if not isinstance(cfg.policy, ImagePolicyConfig):
+        return None
+    names_in_dataset = {renamed: key for key, renamed in cfg.rename_map.items()}
+    return {names_in_dataset.get(key, key) for key in cfg.policy.cameras}
+
+
+def make_accelerator(cfg: TrainPipelineConfig) -> RamAccelerator:
+    """The Accelerator LeRobot's train() would make for the policy of a run, with our loaders.
+
+    Raises:
+        RuntimeError: Several processes were asked for, and accelerate started one.
+    """
+    policy = cfg.policy
     # As in LeRobot: a policy's own `dtype` decides the precision, `use_amp` where it has none.
     dtype = getattr(policy, "dtype", "bfloat16" if policy.use_amp else "float32")
-    return RamAccelerator(
+    accelerator = RamAccelerator(
+        cfg,
         step_scheduler_with_optimizer=False,
         mixed_precision={"bfloat16": "bf16", "float16": "fp16"}.get(dtype, "no"),
-        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
+        kwargs_handlers=[
+            DistributedDataParallelKwargs(find_unused_parameters=True),
+            InitProcessGroupKwargs(timeout=_PATIENCE),
+        ],
         cpu=policy.device == "cpu",
     )
+    # Without GPUs accelerate has no launcher for several processes, but this is what it sets where they were asked for.
+    launched = {"ACCELERATE_USE_CPU", "MASTER_ADDR"} <= os.environ.keys()
+    if launched and accelerator.device.type == "cpu" and accelerator.num_processes == 1:
+        raise RuntimeError(
+            "accelerate launch was asked for several processes on CPUs and started one, which would train on a smaller "
+            "batch than was meant. torchrun starts them: "
+            "torchrun --nproc_per_node=2 -m lerobot_wm.cli train --policy.device=cpu ..."
+        )
+    return accelerator
 
 
 def encode_if_needed(cfg: TrainPipelineConfig) -> None:
@@ -91,11 +151,13 @@ def train(cfg: TrainPipelineConfig) -> None:
         )
     if cfg.dataset.streaming:
         raise ValueError("--dataset.streaming=true reads no dataset into memory: use lerobot-train for it.")
-    encode_if_needed(cfg)
+    accelerator = make_accelerator(cfg)
+    with accelerator.in_turn():
+        encode_if_needed(cfg)
     log = TrainLog(cfg.output_dir)
     logging.getLogger().addFilter(log)
     try:
-        lerobot_train(cfg, accelerator=make_accelerator(cfg.policy))
+        lerobot_train(cfg, accelerator=accelerator)
     finally:
         logging.getLogger().removeFilter(log)
 

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader, Subset
 
-from lerobot_wm.data.cache import camera_frames
+from lerobot_wm.data.cache import CACHE_VARIABLE, camera_frames
 from lerobot_wm.data.fingerprint import dataset_fingerprint
 from lerobot_wm.data.loader import RamDataset, RamLoader, gather
 
@@ -120,6 +121,20 @@ def test_frames_are_decoded_once_and_decoding_resumes(demos_root: Path) -> None:
     assert (again[stop:] == 7).all()
     stored[:] = first.numpy()
     stored.flush()
+
+
+def test_frames_that_do_not_fit_on_the_disk_are_refused(
+    demos_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Writing them through the memory map would end in a bus error when the disk is full.
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    dataset = LeRobotDataset("test/demos", root=demos_root)
+    needed = dataset.num_frames * 64 * 64 * 3
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed - 1))
+    with pytest.raises(OSError, match=CACHE_VARIABLE):
+        camera_frames(dataset, "observation.image")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed))
+    assert len(camera_frames(dataset, "observation.image")) == dataset.num_frames
 
 
 def test_fingerprint_changes_with_content(demos_root: Path, tmp_path: Path) -> None:

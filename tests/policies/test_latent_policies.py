@@ -316,3 +316,16 @@ def test_state_oracle_without_the_full_state_in_the_dataset(oracle: LatentPolicy
     del config.input_features["observation.environment_state"]
     with pytest.raises(ValueError, match=r"dataset has no 'observation\.environment_state'"):
         config.validate_features()
+
+
+def test_cameras_that_a_policy_does_not_read_are_not_decoded(
+    demos_root: Path, tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    """Half of the blind control's training time went into images that it never looked at."""
+    demos = tmp_path / "demos"
+    shutil.copytree(demos_root, demos)
+    lerobot_wm_command(
+        f"train --policy.type=wm_bc --policy.use_latent=false --steps=2 --batch_size=4 {TRAIN_FLAGS}",
+        f"{DATASET_FLAGS.format(root=demos)} --output_dir={tmp_path / 'run'}",
+    )
+    assert not list(tmp_path.rglob("*.npy"))

@@ -35,7 +35,9 @@ class WMRSSMPolicy(StrictPolicy):
         if dataset_meta is not None:  # to be trained
             config.fit_windows(min(dataset_meta.episodes["length"]))
             if REWARD not in dataset_meta.features:
-                config.rssm.predict_reward = False  # nothing to predict; the model is trained without the head
+                config.rssm.predict_reward = (
+                    False  # nothing to predict; the model is trained without the head
+                )
         self.world_model = WorldModel(config.rssm)
         if dataset_stats is not None:  # a checkpoint's own values replace these when it is loaded
             self.world_model.action_scaling.set_range(
