@@ -1,0 +1,1 @@
+"""Speed against the tools people use now: `python -m benchmarks`."""

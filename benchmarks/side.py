@@ -1,0 +1,28 @@
+"""One side of a row in a process of its own: `python -m benchmarks.side MODULE:FUNCTION SIZE_AS_JSON FOLDER`.
+
+It calls `FUNCTION(folder, **size)`, writes the facts it is given as a line of JSON, and then a
+line with one value for every line it reads. What libraries print goes to standard error.
+"""
+
+import importlib
+import json
+import os
+import sys
+from pathlib import Path
+
+
+def main() -> None:
+    """Prepare the side, then answer until standard input is closed."""
+    target, size, folder = sys.argv[1:]
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    module, function = target.split(":")
+    prepare = getattr(importlib.import_module(module), function)
+    prepared = prepare(Path(folder), **json.loads(size))
+    print(json.dumps(prepared.facts), file=answers)
+    for _ in sys.stdin:
+        print(json.dumps(prepared.measure()), file=answers)
+
+
+if __name__ == "__main__":  # worker processes import this module again
+    main()

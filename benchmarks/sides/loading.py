@@ -1,0 +1,108 @@
+"""Batches from LeRobot's DataLoader, and the same batches from ours."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.sampler import EpisodeAwareSampler
+from torch.utils.data import DataLoader
+
+from benchmarks.data import REPO_ID, demonstrations, latents
+from benchmarks.timing import Prepared, rate
+from lerobot_wm.constants import ACTION, FPS, OBS_IMAGE, OBS_LATENT, OBS_STATE, REWARD
+from lerobot_wm.data.loader import RamLoader
+
+CPU = torch.device("cpu")
+
+
+def ram_windows(
+    folder: Path, episodes_per_task: int, batch: int, length: int, workers: int, seconds: float
+) -> Prepared:
+    """Windows per second from RAM, which needs no workers."""
+    loader = _in_ram(_windows(folder, episodes_per_task, batch, length, workers))
+    return _prepared(loader, workers, seconds, per_batch=batch)
+
+
+def lerobot_windows(
+    folder: Path, episodes_per_task: int, batch: int, length: int, workers: int, seconds: float
+) -> Prepared:
+    """Windows per second from LeRobot's loader."""
+    loader = _windows(folder, episodes_per_task, batch, length, workers)
+    return _prepared(loader, workers, seconds, per_batch=batch)
+
+
+def ram_latents(folder: Path, episodes_per_task: int, batch: int, workers: int, seconds: float) -> Prepared:
+    """Batches of latent transitions per second from RAM."""
+    return _prepared(_in_ram(_transitions(folder, episodes_per_task, batch, workers)), workers, seconds)
+
+
+def lerobot_latents(
+    folder: Path, episodes_per_task: int, batch: int, workers: int, seconds: float
+) -> Prepared:
+    """Batches of latent transitions per second from LeRobot's loader."""
+    return _prepared(_transitions(folder, episodes_per_task, batch, workers), workers, seconds)
+
+
+def _windows(folder: Path, episodes_per_task: int, batch: int, length: int, workers: int) -> DataLoader:
+    """LeRobot's loader as `lerobot-train --policy.type=wm_rssm` makes it."""
+    deltas = [i / FPS for i in range(length)]
+    dataset = LeRobotDataset(
+        REPO_ID,
+        root=demonstrations(folder, episodes_per_task),
+        delta_timestamps=dict.fromkeys((OBS_IMAGE, OBS_STATE, ACTION, REWARD), deltas),
+        return_uint8=True,
+    )
+    return _loader(dataset, batch, workers, drop_n_last_frames=length - 1)
+
+
+def _transitions(folder: Path, episodes_per_task: int, batch: int, workers: int) -> DataLoader:
+    """LeRobot's loader as `lerobot-train --policy.type=wm_iql` makes it."""
+    root, _ = latents(folder, episodes_per_task)
+    deltas = {key: [0.0, 1 / FPS] for key in (OBS_LATENT, OBS_STATE)}
+    return _loader(LeRobotDataset(REPO_ID, root=root, delta_timestamps=deltas), batch, workers)
+
+
+class _Endless:
+    """A sampler's epochs, one after the other: `lerobot-train` too keeps its workers from epoch to epoch."""
+
+    def __init__(self, sampler: EpisodeAwareSampler) -> None:
+        self._sampler = sampler
+
+    def __iter__(self) -> Iterator[int]:
+        while True:
+            yield from self._sampler
+
+
+def _loader(dataset: LeRobotDataset, batch: int, workers: int, drop_n_last_frames: int = 0) -> DataLoader:
+    episodes = dataset.meta.episodes
+    sampler = EpisodeAwareSampler(
+        episodes["dataset_from_index"],
+        episodes["dataset_to_index"],
+        drop_n_last_frames=drop_n_last_frames,
+        shuffle=True,
+    )
+    # As many batches ahead as in lerobot-train.
+    return DataLoader(dataset, batch, sampler=_Endless(sampler), num_workers=workers, prefetch_factor=4)
+
+
+def _in_ram(loader: DataLoader) -> RamLoader:
+    assert loader.batch_sampler is not None  # only a loader of an iterable dataset has none
+    return RamLoader(loader, loader.batch_sampler, CPU)
+
+
+def _prepared(loader: DataLoader | RamLoader, workers: int, seconds: float, per_batch: int = 1) -> Prepared:
+    def measure() -> float:
+        # Workers start anew each time, so that none fills its queue unseen. They deliver at about the same time:
+        # whole rounds of them are counted, from the end of the first.
+        batches = iter(loader)
+
+        def draw_round() -> int:
+            for _ in range(workers):
+                next(batches)
+            return workers * per_batch
+
+        draw_round()
+        return rate(draw_round, seconds)
+
+    return Prepared(measure)

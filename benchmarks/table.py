@@ -1,0 +1,71 @@
+"""Rows and results as tables of 100 columns."""
+
+from collections.abc import Iterable
+
+from rich.table import Table
+
+from benchmarks.environments import OWN
+from benchmarks.measure import Result
+from benchmarks.rows import Row, Size
+
+WIDTH = 100
+
+
+def number(value: float) -> str:
+    """Three significant digits, without an exponent."""
+    if value == 0:
+        return "0"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:#.3g}".rstrip(".")
+
+
+def size_text(size: Size) -> str:
+    """`batch 16, length 25`."""
+    return ", ".join(f"{name.replace('_', ' ')} {value:g}" for name, value in size.items())
+
+
+def results_table(results: Iterable[Result]) -> Table:
+    """Medians with their ranges, and how many times faster ours is; every row at its sizes."""
+    table = Table(width=WIDTH, title="Median, and lowest and highest value below it")
+    for title in ("row", "size", "against"):
+        table.add_column(title, overflow="fold")
+    for title in ("ours", "peer", "times faster"):
+        table.add_column(title, justify="right", overflow="fold")
+    for result in results:
+        peer, ratio = "", ""
+        if result.peer is not None and result.ratio is not None:
+            peer, ratio = _spread(result.peer, result.spread["peer"]), number(result.ratio)
+        table.add_row(
+            f"{result.row}\n{result.unit}",
+            size_text(result.sizes),
+            result.peer_name or "",
+            _spread(result.ours, result.spread["ours"]),
+            peer,
+            ratio,
+        )
+    return table
+
+
+def rows_table(rows: Iterable[Row], scale: float) -> Table:
+    """What can be measured, at which sizes, and the environment each peer needs."""
+    table = Table(width=WIDTH)
+    for title in ("row", "what", "sizes", "against (needs)"):
+        table.add_column(title, overflow="fold")
+    for row in rows:
+        table.add_row(
+            row.name,
+            f"{row.title}; {row.unit}",
+            "\n".join(size_text(size) for size in row.scaled_sizes(scale)),
+            "\n".join(f"{peer.name} ({_needs(peer.environment)})" for peer in row.peers) or "nobody",
+        )
+    return table
+
+
+def _spread(median: float, ends: list[float]) -> str:
+    low, high = ends
+    return f"{number(median)}\n[{number(low)}, {number(high)}]"
+
+
+def _needs(environment: str) -> str:
+    return "nothing more" if environment == OWN else f"the environment {environment}"
