@@ -25,7 +25,6 @@ import psutil
 import torch
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import EpisodeAwareSampler
-from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import BatchSampler
@@ -34,6 +33,7 @@ from lerobot_wm.constants import FPS, OBS_IMAGE
 from lerobot_wm.data.cache import CACHE_VARIABLE, cache_root
 from lerobot_wm.data.loader import RamDataset
 from lerobot_wm.data.schema import metaworld_features
+from lerobot_wm.pipeline.merge import merge_datasets
 from lerobot_wm.report.provenance import provenance
 
 SIZE, LENGTH, EPISODES = 64, 100, 20  # pixels, frames of an episode, episodes of the piece that is repeated
@@ -70,16 +70,7 @@ def make_dataset(folder: Path, gigabytes: float) -> Path:
     """A LeRobotDataset whose decoded frames take about this much; returns its root."""
     write_piece(folder / "piece")
     pieces = max(1, round(gigabytes * 1e9 / PIECE_BYTES))
-    times = round(pieces**0.5)  # in two steps: the time of merging grows with the square of the number
-    for source, count, root in (("piece", times, "pieces"), ("pieces", round(pieces / times), "dataset")):
-        aggregate_datasets(
-            repo_ids=[REPO] * count,
-            roots=[folder / source] * count,
-            aggr_repo_id=REPO,
-            aggr_root=folder / root,
-            concatenate_videos=False,
-            concatenate_data=False,
-        )
+    merge_datasets([folder / "piece"] * pieces, REPO, folder / "dataset")
     return folder / "dataset"
 
 
