@@ -16,6 +16,8 @@ class RSSMConfig:
         kl_scale: Weight β of the KL term.
         free_nats: KL per step (nats) below which the KL is not penalised.
         reward_scale: Weight of the reward loss.
+        image_error_weight: w of the image loss e² (1 + w |e|), e in [-1, 1]; 0 is the paper's squared error. Above
+            it, what is small and wrong weighs more.
         predict_reward: Whether there is a reward head (turned off for datasets without `next.reward`).
         use_proprio: Encode and reconstruct proprioception beside the image (the paper's discarded variant).
         image_channels: Channels of the image; filled from the dataset.
@@ -31,6 +33,7 @@ class RSSMConfig:
     kl_scale: float = 1.0
     free_nats: float = 3.0
     reward_scale: float = 1.0
+    image_error_weight: float = 0.0
     predict_reward: bool = True
     use_proprio: bool = False
     image_channels: int = 0

@@ -5,9 +5,17 @@ from torch import Tensor
 from lerobot_wm.world_model.config import RSSMConfig
 
 
-def reconstruction_loss(prediction: Tensor, target: Tensor) -> Tensor:
-    """Squared error summed over everything but batch and time: (B, T, ...) -> (B, T), in float32."""
-    return (prediction.float() - target.float()).square().flatten(2).sum(-1)
+def reconstruction_loss(prediction: Tensor, target: Tensor, error_weight: float = 0.0) -> Tensor:
+    """Squared error e² (1 + w |e|) summed over everything but batch and time: (B, T, ...) -> (B, T), in float32.
+
+    With w = `error_weight` above zero large errors count for more than their square: a few pixels that are wholly
+    wrong, such as a small object left out, stand up against many that are slightly off.
+    """
+    error = prediction.float() - target.float()
+    squared = error.square()
+    if error_weight > 0:
+        squared = squared * (1 + error_weight * error.abs())
+    return squared.flatten(2).sum(-1)
 
 
 def masked_mean(values: Tensor, valid: Tensor) -> Tensor:

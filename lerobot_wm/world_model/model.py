@@ -146,7 +146,8 @@ class WorldModel(nn.Module):
         latents = states.latent  # (B, T, D+S)
 
         decoded = self.decoder(latents.flatten(0, 1)).unflatten(0, latents.shape[:2])
-        errors = {"image_loss": reconstruction_loss(decoded, images)}  # (B, T)
+        image_loss = reconstruction_loss(decoded, images, self.config.image_error_weight)  # (B, T)
+        errors = {"image_loss": image_loss}
         if self.config.use_proprio:
             errors["proprio_loss"] = reconstruction_loss(
                 self.proprio_decoder(latents), self.proprio_scaling(proprio)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from lerobot_wm.policies.features import default_dtype
 from lerobot_wm.world_model.config import RSSMConfig
-from lerobot_wm.world_model.losses import world_model_loss
+from lerobot_wm.world_model.losses import reconstruction_loss, world_model_loss
 from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import DiagonalNormal
 
@@ -175,3 +175,27 @@ def test_actions_are_scaled_by_the_models_own_statistics() -> None:
     scaled.action_scaling.offset.zero_()
     raw = scaled.action_scaling.inverse(actions)
     torch.testing.assert_close(scaled.filter(images, raw).latent, model.filter(images, actions).latent)
+
+
+def test_weighted_image_error_favours_few_large_errors_over_many_small() -> None:
+    target = torch.zeros(1, 1, 3, 4, 4)
+    lost_pixel, grey_veil = target.clone(), torch.full_like(target, 48**-0.5)
+    lost_pixel[..., 0, 0, 0] = 1.0
+    losses = {
+        weight: [reconstruction_loss(image, target, weight).item() for image in (lost_pixel, grey_veil)]
+        for weight in (0.0, 20.0)
+    }
+    assert losses[0.0] == pytest.approx([1.0, 1.0])
+    assert losses[20.0] == pytest.approx([21.0, 1 + 20 * 48**-0.5])
+
+
+def test_weighted_image_error_is_what_the_model_descends() -> None:
+    images, actions = two_lamps(2, 4, seed=8)
+    valid = torch.ones(2, 4, dtype=torch.bool)
+    parts = []
+    for weight in (0.0, 20.0):
+        model = make_world_model(predict_reward=False, image_error_weight=weight)
+        torch.manual_seed(1)
+        parts.append(model.loss(images, actions, valid)[1])
+    assert parts[1]["image_loss"] > 2 * parts[0]["image_loss"]
+    assert parts[1]["kl"] == parts[0]["kl"]
