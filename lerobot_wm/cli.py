@@ -3,6 +3,8 @@
 import importlib
 import sys
 
+from lerobot_wm.hub.errors import exit_on_hub_error
+
 # name -> (module with a main() that reads sys.argv, what it does)
 COMMANDS: dict[str, tuple[str, str]] = {
     "collect": ("lerobot_wm.pipeline.collect", "scripted-expert Meta-World demonstrations -> LeRobotDataset"),
@@ -14,6 +16,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "eval": ("lerobot_wm.pipeline.evaluate", "lerobot-eval with its flags, one record per rollout"),
     "report": ("lerobot_wm.report.build", "records -> success table and self-contained HTML page"),
     "quality": ("lerobot_wm.report.quality", "how good a world model is on positions it was not trained on"),
+    "dream": ("lerobot_wm.pipeline.dream", "an episode as a world model imagines it: video and strip"),
+    "publish": ("lerobot_wm.pipeline.publish", "checkpoint -> the Hub, with results and a dream on its card"),
     "doctor": ("lerobot_wm.pipeline.doctor", "check Python, GL, packages, GPU, disk and Hub login"),
 }
 
@@ -35,7 +39,8 @@ def main() -> None:
         sys.exit(f"lerobot-wm: no command '{name}'; expected one of {', '.join(COMMANDS)}.")
     # LeRobot's parsers read sys.argv themselves: hand the subcommand its own argument list.
     sys.argv = [f"lerobot-wm {name}", *sys.argv[2:]]
-    importlib.import_module(COMMANDS[name][0]).main()
+    with exit_on_hub_error(sys.argv[0]):
+        importlib.import_module(COMMANDS[name][0]).main()
 
 
 if __name__ == "__main__":

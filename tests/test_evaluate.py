@@ -23,6 +23,7 @@ from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.pipeline.eval_config import BatchedEvalConfig, EvaluateConfig, variation_of
 from lerobot_wm.pipeline.evaluate import evaluate
 from lerobot_wm.pipeline.rollouts import TaskRunner, training_seed
+from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.report.records import RECORD_KEYS, read_records
 
 IMAGE = PolicyFeature(FeatureType.VISUAL, (64, 64, 3))
@@ -254,6 +255,7 @@ def test_repeated_variations_are_refused(policy_path: Path, tmp_path: Path) -> N
         ({"seed": None}, r"--seed=0"),
         ({"num_workers": 0}, "at least 1"),
         ({"eval": BatchedEvalConfig(n_episodes=1, recording=True)}, "lerobot-eval"),
+        ({"policy": WMBCConfig(save_predicted_video=True)}, "lerobot-eval"),
     ],
 )
 def test_bad_flags_are_refused(policy_path: Path, tmp_path: Path, change: dict, message: str) -> None:

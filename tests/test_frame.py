@@ -26,11 +26,12 @@ LEVELS = {
     "rl": 2,
     "data": 3,
     "envs": 3,
-    "policies": 4,
-    "report": 5,
-    "pipeline": 6,
-    "experiment": 7,
-    "cli": 8,
+    "hub": 4,
+    "policies": 5,
+    "report": 6,
+    "pipeline": 7,
+    "experiment": 8,
+    "cli": 9,
 }
 # Usable in any torch program: these know neither LeRobot nor a simulator.
 TORCH_ONLY = ("nn", "world_model", "rl")
@@ -135,6 +136,9 @@ def test_wheel_holds_modules_data_and_license(tmp_path: Path) -> None:
     assert tracked <= names
     data = {
         "lerobot_wm/envs/variations.json",
+        "lerobot_wm/hub/demonstrations.md.j2",
+        "lerobot_wm/hub/latents.md.j2",
+        "lerobot_wm/hub/model_card.md.j2",
         "lerobot_wm/report/page.html.j2",
         "lerobot_wm/report/quality_section.html.j2",
         "lerobot_policy_wm.py",

@@ -1,12 +1,13 @@
-"""Camera frames decoded once into uint8 and memory-mapped from a file beside the dataset."""
+"""Camera frames decoded once, at a model's image size, into uint8 and memory-mapped from a file beside the dataset."""
 
 import logging
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,10 +19,13 @@ from tqdm import tqdm
 
 from lerobot_wm.cores import usable_cores
 from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.resize import resize_images
 
 logger = logging.getLogger(__name__)
 
 CACHE_VARIABLE = "LEROBOT_WM_CACHE"
+
+_FRAMES_PER_CHUNK = 64  # held as float32 at once: bounds memory for long episodes of large images
 
 
 def cache_root(dataset_root: Path) -> Path:
@@ -49,16 +53,28 @@ class CameraCache:
 
     Episodes are decoded on first use, and each is marked when its frames are on disk: an interrupted decoding
     goes on where it stopped, and a dataset opened for some episodes decodes only those.
+
+    Args:
+        dataset: The dataset.
+        key: The camera.
+        folder: Where its file lies; each size has one.
+        size: (H, W) that frames are resized to; None leaves them.
     """
 
-    def __init__(self, dataset: LeRobotDataset, key: str, folder: Path) -> None:
+    def __init__(
+        self, dataset: LeRobotDataset, key: str, folder: Path, size: tuple[int, int] | None = None
+    ) -> None:
         self._dataset = dataset
         self._key = key
         self._folder = folder
         height, width, channels = self._frame_shape()
+        name = key
+        if size not in (None, (height, width)):
+            name = f"{key}-{size[0]}x{size[1]}"
+            height, width = size
         shape = (dataset.meta.total_frames, height, width, channels)
-        self._frames = self._open(folder / f"{key}.npy", shape)
-        self._decoded = self._open(folder / f"{key}.decoded.npy", (dataset.meta.total_episodes,))
+        self._frames = self._open(folder / f"{name}.npy", shape)
+        self._decoded = self._open(folder / f"{name}.decoded.npy", (dataset.meta.total_episodes,))
 
     @property
     def frames(self) -> np.ndarray:
@@ -91,26 +107,38 @@ class CameraCache:
             )
 
     def _decode(self, episode: int) -> None:
+        row = self._dataset.meta.episodes[episode]
+        size = self._frames.shape[1:3]
+        position = row["dataset_from_index"]
+        for images in self._images(row):
+            if images.shape[-2:] != size:
+                images = (resize_images(images.float() / 255, size) * 255).round().to(torch.uint8)
+            self._frames[position : position + len(images)] = images.permute(0, 2, 3, 1).numpy()
+            position += len(images)
+        self._frames.flush()
+        self._decoded[episode] = 1
+
+    def _images(self, row: dict[str, Any]) -> Iterator[Tensor]:
+        """An episode's frames as they are stored, some at a time: (T, C, H, W) uint8."""
         meta = self._dataset.meta
-        row = meta.episodes[episode]
         start, stop = row["dataset_from_index"], row["dataset_to_index"]
         if self._key in meta.video_keys:
             # LeRobot's own decoder, asked for a whole episode at once: equal frames, one seek.
             first = row[f"videos/{self._key}/from_timestamp"]
             images = decode_video_frames(
-                self._dataset.root / meta.get_video_file_path(episode, self._key),
+                self._dataset.root / meta.get_video_file_path(row["episode_index"], self._key),
                 [first + i / meta.fps for i in range(stop - start)],
                 tolerance_s=1 / (4 * meta.fps),
                 return_uint8=True,
-            )  # (T, C, H, W)
-        else:
-            relative = self._dataset.absolute_to_relative_idx
-            first = start if relative is None else relative[start]
-            rows = self._dataset.hf_dataset[first : first + stop - start][self._key]
-            images = (torch.stack(rows) * 255).round().to(torch.uint8)  # (T, C, H, W)
-        self._frames[start:stop] = images.permute(0, 2, 3, 1).numpy()
-        self._frames.flush()
-        self._decoded[episode] = 1
+            )
+            yield from images.split(_FRAMES_PER_CHUNK)
+            return
+        relative = self._dataset.absolute_to_relative_idx
+        column = self._dataset.hf_dataset.select_columns(self._key)  # other cameras' images stay undecoded
+        for position in range(start, stop, _FRAMES_PER_CHUNK):
+            first = position if relative is None else relative[position]
+            rows = column[first : first + min(_FRAMES_PER_CHUNK, stop - position)][self._key]
+            yield (torch.stack(rows) * 255).round().to(torch.uint8)
 
     def _frame_shape(self) -> tuple[int, int, int]:
         feature = self._dataset.meta.features[self._key]
@@ -130,13 +158,18 @@ class CameraCache:
         return open_memmap(path, mode="r+")
 
 
-def camera_frames(dataset: LeRobotDataset, key: str) -> Tensor:
+def camera_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int] | None = None) -> Tensor:
     """A camera's decoded frames, (N, H, W, C) uint8 by absolute index, memory-mapped.
 
     Frames of episodes outside `dataset.episodes` are zero unless an earlier call decoded them.
+
+    Args:
+        dataset: The dataset.
+        key: The camera.
+        size: (H, W) that frames are resized to, once; None leaves them as they are in the dataset.
     """
     folder = cache_root(Path(dataset.root)) / f"frames-{dataset_fingerprint(Path(dataset.root))}"
     folder.mkdir(exist_ok=True)
-    cache = CameraCache(dataset, key, folder)
+    cache = CameraCache(dataset, key, folder, size)
     cache.ensure(range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes)
     return torch.from_numpy(cache.frames)

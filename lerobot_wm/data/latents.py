@@ -1,7 +1,7 @@
 """The record a latent dataset carries: which world model and which dataset it was made from."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 RECORD_PATH = "meta/latents.json"
@@ -17,6 +17,7 @@ class LatentRecord:
         source_fingerprint: `dataset_fingerprint` of it.
         tasks: Its task strings, in order of task_index.
         sampled: False where z_t is the posterior mean, True where it is a sample.
+        camera_shapes: (C, H, W) of the cameras that were encoded, as they are in that dataset; none in older records.
     """
 
     world_model_fingerprint: str
@@ -24,6 +25,7 @@ class LatentRecord:
     source_fingerprint: str
     tasks: list[str]
     sampled: bool
+    camera_shapes: dict[str, list[int]] = field(default_factory=dict)
 
     def write(self, root: Path) -> None:
         """Write the record into the dataset at `root`."""

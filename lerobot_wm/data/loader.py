@@ -1,6 +1,6 @@
-"""Batches equal to LeRobot's DataLoader, gathered from RAM or GPU memory."""
+"""Batches equal to LeRobot's DataLoader, gathered from RAM or GPU memory; images at the size a policy takes."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -34,14 +34,18 @@ class RamDataset:
     Args:
         dataset: The dataset, with the delta indices it was opened with.
         device: Frames are kept here when they fit, else in a memory map; the columns always are.
-        cameras: Those to decode and serve; None for all.
+        cameras: Those to decode and serve, each with the (H, W) its images are brought to; None for all of the dataset,
+            as they are.
 
     Raises:
         ValueError: The dataset applies image transforms, which decoded frames do not go through.
     """
 
     def __init__(
-        self, dataset: LeRobotDataset, device: torch.device, cameras: Collection[str] | None = None
+        self,
+        dataset: LeRobotDataset,
+        device: torch.device,
+        cameras: Mapping[str, tuple[int, int]] | None = None,
     ) -> None:
         if dataset.reader._image_transforms is not None:
             raise ValueError(
@@ -61,7 +65,7 @@ class RamDataset:
         # PNG frames leave LeRobot's loader as float32, video frames as uint8 for the training loop to convert.
         self._float_cameras = set(meta.image_keys)
         self._cameras = {
-            key: self._resident(camera_frames(dataset, key))
+            key: self._resident(camera_frames(dataset, key, None if cameras is None else cameras[key]))
             for key in meta.camera_keys
             if cameras is None or key in cameras
         }
@@ -119,7 +123,7 @@ class RamLoader:
         data_loader: The loader LeRobot built; its batch sampler gives the order, its dataset the frames.
         batch_sampler: What to iterate in its place, e.g. this process's share of it.
         device: Where batches are put.
-        cameras: Those to serve; None for all.
+        cameras: Those to serve, see `RamDataset`.
     """
 
     def __init__(
@@ -127,7 +131,7 @@ class RamLoader:
         data_loader: DataLoader,
         batch_sampler: Iterable[list[int]],
         device: torch.device,
-        cameras: Collection[str] | None = None,
+        cameras: Mapping[str, tuple[int, int]] | None = None,
     ) -> None:
         dataset: Any = data_loader.dataset
         self._subset: Sequence[int] | None = None

@@ -1,9 +1,13 @@
 """The numeric columns of a LeRobotDataset as tensors, read from Arrow in one pass."""
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
 from datasets import Dataset
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
 
@@ -29,6 +33,26 @@ def column_tensor(dataset: Dataset, key: str, shape: tuple[int, ...]) -> Tensor:
         )
     tensor = torch.from_numpy(values)
     return tensor if shape == (1,) else tensor.reshape(-1, *shape)
+
+
+def frame_numbers(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
+    """A column of one number per frame, read from the dataset's files.
+
+    Args:
+        meta: The dataset's; its tables are on this machine.
+        key: The column.
+
+    Returns:
+        (N,) float32 by absolute frame index; zero for frames whose files are not here.
+    """
+    numbers = torch.zeros(meta.total_frames)
+    for path in sorted((Path(meta.root) / "data").rglob("*.parquet")):
+        table = pq.read_table(path, columns=["index", key])
+        index, values = (
+            np.concatenate([_flat_values(chunk) for chunk in table[name].chunks]) for name in ("index", key)
+        )
+        numbers[torch.from_numpy(index)] = torch.from_numpy(values.astype(np.float32))
+    return numbers
 
 
 def _flat_values(array: pa.Array) -> np.ndarray:

@@ -38,6 +38,18 @@ class MLP(nn.Module):
         self.trunk = nn.Sequential(*layers)
         self.head = nn.Linear(input_dim, output_dim)
 
+    @torch.no_grad()
+    def insert_inputs(self, place: int, count: int) -> None:
+        """Take `count` more inputs from index `place` on, with weights of zero: as yet they change nothing.
+
+        The first layer's weight becomes another parameter: optimizers are to be made afterwards.
+        """
+        first = next(layer for layer in self.modules() if isinstance(layer, nn.Linear))
+        before, after = first.weight[:, :place], first.weight[:, place:]
+        zeros = first.weight.new_zeros(first.out_features, count)
+        first.weight = nn.Parameter(torch.cat([before, zeros, after], dim=1), first.weight.requires_grad)
+        first.in_features += count
+
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., input_dim) to float32 (..., output_dim)."""
         hidden = self.trunk(x)  # (..., hidden_dims[-1])

@@ -8,8 +8,11 @@ import time
 from pathlib import Path
 
 import draccus
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import CAMERA_NAME, REPORTED_VARIATION_SET
+from lerobot_wm.hub.dataset_card import push_demonstrations
+from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.pipeline.collect_config import CollectConfig, plan_shards
 from lerobot_wm.pipeline.collect_record import ShardRecord
 from lerobot_wm.pipeline.collect_report import COLLECTION_RECORD, print_summary, write_collection_record
@@ -69,6 +72,13 @@ def collect(config: CollectConfig) -> Path:
     return root
 
 
+def push(config: CollectConfig) -> None:
+    """Upload the finished dataset of a configuration, with a card that says how it came about."""
+    record = json.loads((config.output_root / COLLECTION_RECORD).read_text())
+    dataset = LeRobotDataset(config.repo_id, root=config.output_root)
+    push_demonstrations(dataset, {**record, "config": config.identity()}, config.private, config.license)
+
+
 def _is_complete(config: CollectConfig, root: Path) -> bool:
     if not root.exists():
         return False
@@ -110,12 +120,17 @@ def main() -> None:
     """Entry point of `lerobot-wm collect`."""
     logging.basicConfig(level=logging.WARNING)
     try:
-        collect(draccus.parse(CollectConfig, args=sys.argv[1:]))
+        config = draccus.parse(CollectConfig, args=sys.argv[1:])
+        if config.push_to_hub:
+            check_can_push(config.repo_id)
+        collect(config)
     except draccus.ParsingError as error:
         # Why CollectConfig refused its flags is the cause.
         sys.exit(f"lerobot-wm collect: {error} {error.__cause__ or ''}")
     except (ValueError, FileExistsError, RuntimeError) as error:
         sys.exit(f"lerobot-wm collect: {error}")
+    if config.push_to_hub and config.shard is None:
+        push(config)
 
 
 if __name__ == "__main__":

@@ -47,6 +47,12 @@ class CollectConfig:
     # Of several jobs, the one this is: 1/4 is the first of four. Each job collects its share of the shards into
     # `<root>.shards`; when all are in one such folder, the same command without this flag merges them.
     shard: str | None = None
+    # Upload the dataset as repo_id when it is complete, also where it was so before.
+    push_to_hub: bool = False
+    # Upload to a private repository.
+    private: bool = False
+    # Licence of the uploaded dataset, as the Hub names it.
+    license: str = "apache-2.0"
 
     def __post_init__(self) -> None:
         """Check every field."""

@@ -5,7 +5,7 @@ A frozen image backbone may stand in its place: its latents are the pooled featu
 
 import logging
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import draccus
@@ -15,17 +15,21 @@ from lerobot.datasets.dataset_tools import modify_features
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.device_utils import auto_select_torch_device
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import OBS_LATENT, OBS_STATE
 from lerobot_wm.data.cache import cache_root
 from lerobot_wm.data.fingerprint import dataset_fingerprint, weights_fingerprint
 from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.hub.dataset_card import license_of, push_latents
+from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.pipeline.encode_episodes import episode_batches
 from lerobot_wm.pipeline.encode_parts import LatentParts
 from lerobot_wm.pipeline.quiet import quiet
-from lerobot_wm.pipeline.share import Share
+from lerobot_wm.pipeline.share import Share, refuse_difference
 from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.policies.frozen_encoder import EncoderPolicy, load_encoder
+from lerobot_wm.world_model.model import WorldModel
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +39,8 @@ class EncodeConfig:
     """Flags of `lerobot-wm encode`.
 
     Args:
-        world_model_path: Folder or Hub id of a wm_rssm or frozen_backbone checkpoint.
+        world_model_path: Folder or Hub id (user/name or user/name@revision) of a wm_rssm or frozen_backbone checkpoint,
+            or of a policy on latents, which has its own in it.
         dataset: The image dataset.
         output_repo_id: Repository id of the latent dataset.
         output_root: Its folder; must not exist yet.
@@ -46,7 +51,9 @@ class EncodeConfig:
             into `<output_root>.parts`; when all are in one such folder, the same command without this flag makes the
             dataset of them. Where machines share a disk, set LEROBOT_WM_CACHE to a folder of its own for each: they
             must not decode frames into one file.
-        push_to_hub: Upload the result as `output_repo_id`.
+        push_to_hub: Upload the result as `output_repo_id`; also one that was encoded before.
+        private: Upload to a private repository.
+        license: Licence of the uploaded dataset, as the Hub names it; None takes what the source's card says.
     """
 
     world_model_path: str
@@ -58,6 +65,8 @@ class EncodeConfig:
     device: str | None = None
     shard: str | None = None
     push_to_hub: bool = False
+    private: bool = False
+    license: str | None = None
 
 
 def encode(
@@ -145,19 +154,25 @@ def _begin(
         raise ValueError(
             f"{source.repo_id} has no '{OBS_STATE}', which every policy on latents reads beside them."
         )
-    record = LatentRecord(
-        world_model_fingerprint=weights_fingerprint(policy.world_model),
-        source_repo_id=source.repo_id,
-        source_fingerprint=dataset_fingerprint(Path(source.root)),
-        tasks=[str(task) for task in source.meta.tasks.index],
-        sampled=sample_seed is not None,
-    )
+    record = _record(policy, source, sample_seed)
     made_of = {
         "world_model_fingerprint": record.world_model_fingerprint,
         "source_fingerprint": record.source_fingerprint,
         "sample_seed": str(sample_seed),
     }
     return record, LatentParts(output_root.with_name(f"{output_root.name}.parts"), made_of)
+
+
+def _record(policy: EncoderPolicy, source: LeRobotDataset, sample_seed: int | None) -> LatentRecord:
+    features = dataset_to_policy_features(source.meta.features)
+    return LatentRecord(
+        world_model_fingerprint=weights_fingerprint(policy.world_model),
+        source_repo_id=source.repo_id,
+        source_fingerprint=dataset_fingerprint(Path(source.root)),
+        tasks=[str(task) for task in source.meta.tasks.index],
+        sampled=sample_seed is not None,
+        camera_shapes={key: list(features[key].shape) for key in policy.config.cameras if key in features},
+    )
 
 
 def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMetadata, device: str) -> Path:
@@ -185,9 +200,18 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
     return output_root
 
 
+def _check_same(found: LatentRecord, expected: LatentRecord, root: Path) -> None:
+    names = ("world_model_fingerprint", "source_fingerprint", "sampled")
+    here = {name: value for name, value in asdict(expected).items() if name in names}
+    mend = "choose another --output_root, or remove it"
+    refuse_difference(asdict(found), here, f"{root} holds latents", mend)
+
+
 def main() -> None:
     """Entry point of `lerobot-wm encode`."""
     cfg = draccus.parse(EncodeConfig)
+    if cfg.push_to_hub:
+        check_can_push(cfg.output_repo_id)
     share = Share.parse(cfg.shard) if cfg.shard else None
     policy = load_encoder(cfg.world_model_path)
     policy.to(cfg.device or auto_select_torch_device())
@@ -196,7 +220,14 @@ def main() -> None:
     if share is not None:
         encode_share(policy, source, cfg.output_root, share, sample_seed=sample_seed)
         return
-    dataset = encode(policy, source, cfg.output_repo_id, cfg.output_root, sample_seed=sample_seed)
+    if cfg.push_to_hub and cfg.output_root.exists():  # a push that did not finish is begun again
+        _check_same(LatentRecord.read(cfg.output_root), _record(policy, source, sample_seed), cfg.output_root)
+        dataset = LeRobotDataset(cfg.output_repo_id, root=cfg.output_root)
+    else:
+        dataset = encode(policy, source, cfg.output_repo_id, cfg.output_root, sample_seed=sample_seed)
     print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames -> {cfg.output_root}")
     if cfg.push_to_hub:
-        dataset.push_to_hub(tags=["lerobot_wm", "latents"])
+        record = LatentRecord.read(cfg.output_root)
+        encoder = "world model" if isinstance(policy.world_model, WorldModel) else "image backbone"
+        license = cfg.license or license_of(source)
+        push_latents(dataset, record, encoder, cfg.world_model_path, cfg.private, license)

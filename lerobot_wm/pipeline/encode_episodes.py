@@ -44,8 +44,8 @@ def filter_batches(
     device = next(world_model.parameters()).device
     episodes = [episode for batch in batches for episode in batch]
     dataset = LeRobotDataset(source.repo_id, source.root, episodes, revision=source.revision)
-    # Of each camera (N, H, W, C) uint8, by absolute index.
-    cameras = [camera_frames(dataset, key) for key in policy.config.cameras]
+    # Of each camera (N, H, W, C) uint8, by absolute index; the files that training reads.
+    cameras = [camera_frames(dataset, key, image_size) for key in policy.config.cameras]
     all_lengths = source.meta.episodes["length"][:]
     lengths = [all_lengths[episode] for episode in episodes]
     # Of each episode, its rows of a column.

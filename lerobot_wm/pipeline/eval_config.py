@@ -9,6 +9,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.variations import is_seen, split_variations
+from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
 
 @dataclass
@@ -56,6 +57,10 @@ class EvaluateConfig(EvalPipelineConfig):
             raise ValueError(f"--num_workers={self.num_workers}: expected at least 1.")
         if self.eval.recording:
             raise ValueError("--eval.recording=true records datasets: use `lerobot-eval` for that.")
+        if isinstance(self.policy, LatentPolicyConfig) and self.policy.save_predicted_video:
+            raise ValueError(
+                "--policy.save_predicted_video=true films predictions: use `lerobot-eval` for that."
+            )
         if self.records_file.exists():
             raise FileExistsError(
                 f"{self.records_file} holds the records of an earlier evaluation: remove it, or give another "

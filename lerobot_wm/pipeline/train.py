@@ -20,6 +20,7 @@ from lerobot.utils.logging_utils import MetricsTracker
 
 from lerobot_wm.constants import OBS_LATENT
 from lerobot_wm.data.loader import RamLoader
+from lerobot_wm.hub.errors import check_can_push, check_dataset_version
 from lerobot_wm.pipeline.encode import encode_to_cache
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
@@ -87,12 +88,16 @@ class TrainLog(logging.Filter):
         return True
 
 
-def cameras_to_serve(cfg: TrainPipelineConfig) -> set[str] | None:
-    """The dataset's cameras that the policy looks at, where it is one of ours; None, all of them, where it is not."""
-    if not isinstance(cfg.policy, ImagePolicyConfig):
+def cameras_to_serve(cfg: TrainPipelineConfig) -> dict[str, tuple[int, int]] | None:
+    """The dataset's cameras that the policy looks at, and (H, W) it brings their images to.
+
+    None, all of them as they are, where the policy is not one of ours.
+    """
+    policy = cfg.policy
+    if not isinstance(policy, ImagePolicyConfig):
         return None
     names_in_dataset = {renamed: key for key, renamed in cfg.rename_map.items()}
-    return {names_in_dataset.get(key, key) for key in cfg.policy.cameras}
+    return {names_in_dataset.get(key, key): policy.image_size for key in policy.cameras}
 
 
 def make_accelerator(cfg: TrainPipelineConfig) -> RamAccelerator:
@@ -132,11 +137,17 @@ def encode_if_needed(cfg: TrainPipelineConfig) -> None:
         cfg: Changed in place: its dataset becomes the encoded one.
     """
     policy = cfg.policy
-    if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent or policy.world_model_path is None:
+    if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent:
+        return
+    encoder = policy.world_model_path
+    if policy.pretrained_path is not None:  # trained on: its checkpoint holds the world model
+        revision = f"@{policy.pretrained_revision}" if policy.pretrained_revision else ""
+        encoder = f"{policy.pretrained_path}{revision}"
+    if encoder is None:
         return
     meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
     if OBS_LATENT not in meta.features:
-        encoded = encode_to_cache(policy.world_model_path, cfg.dataset.repo_id, meta, str(policy.device))
+        encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device))
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None
 
@@ -152,6 +163,9 @@ def train(cfg: TrainPipelineConfig) -> None:
     if cfg.dataset.streaming:
         raise ValueError("--dataset.streaming=true reads no dataset into memory: use lerobot-train for it.")
     accelerator = make_accelerator(cfg)
+    if cfg.policy.push_to_hub and accelerator.is_main_process:
+        check_can_push(cfg.policy.repo_id)  # now, not when hours of training are over
+    check_dataset_version(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     with accelerator.in_turn():
         encode_if_needed(cfg)
     log = TrainLog(cfg.output_dir)

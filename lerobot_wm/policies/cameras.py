@@ -6,9 +6,10 @@ from typing import Any
 
 import torch
 from lerobot.configs import PreTrainedConfig
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_wm.constants import OBS_IMAGE
+from lerobot_wm.data.resize import resize_images
 from lerobot_wm.policies.features import image_keys
 
 
@@ -27,6 +28,11 @@ class ImagePolicyConfig(PreTrainedConfig):
     def cameras(self) -> list[str]:
         """Feature keys of the cameras; none for a policy without images, or before `choose_cameras`."""
         return self.image_key.split(",") if self.image_key else []
+
+    @property
+    def features_read(self) -> list[str]:
+        """Keys of what the policy reads of an observation."""
+        return list(self.input_features)
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -63,14 +69,6 @@ class ImagePolicyConfig(PreTrainedConfig):
         self.image_key = ",".join(chosen)
 
 
-def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
-    """Bring images (..., C, H, W) to a size (H, W) by area averaging; images of this size pass untouched."""
-    if images.shape[-2:] == size:
-        return images
-    flat = nn.functional.interpolate(images.flatten(0, -4), size=size, mode="area")
-    return flat.unflatten(0, images.shape[:-3])
-
-
 def stack_images(images: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
     """Resize each camera's images (..., C, H, W) and stack them along channels: (..., K·C, *size)."""
     resized = [resize_images(image, size) for image in images]
@@ -86,7 +84,11 @@ def camera_images(config: ImagePolicyConfig, batch: Mapping[str, Tensor]) -> Ten
 
     Returns:
         (..., K·C, H, W), the K cameras in their order.
+
+    Raises:
+        ValueError: A camera is missing.
     """
+    _check_there(config, batch)
     return stack_images([batch[key] for key in config.cameras], config.image_size)
 
 
@@ -96,20 +98,25 @@ def check_images(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:
     Raises:
         ValueError: A camera is missing or has another size than in training.
     """
+    _check_there(config, batch)
     for key in config.cameras:
         expected = tuple(config.input_features[key].shape)
-        if key not in batch:
-            shown = [name for name in batch if name.startswith(OBS_IMAGE)]
-            raise ValueError(
-                f"This policy sees '{key}'; the observation has {', '.join(shown) or 'no image'}. Add the camera to "
-                "the robot or environment (--env.camera_name=corner2,topview for metaworld_mt), or give its name to "
-                "one that shows the same, by --rename_map."
-            )
         found = tuple(batch[key].shape[1:])
         if found != expected:
             raise ValueError(
                 f"'{key}' is {found}, this policy was trained on {expected} (C, H, W): set the camera or environment "
                 f"to {expected[1]}x{expected[2]} (--env.image_size={expected[1]} for metaworld_mt)."
+            )
+
+
+def _check_there(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:
+    for key in config.cameras:
+        if key not in batch:
+            shown = [name for name in batch if name.startswith(OBS_IMAGE) and not name.endswith("_is_pad")]
+            raise ValueError(
+                f"This policy sees '{key}'; the observation has {', '.join(shown) or 'no image'}. Add the camera to "
+                "the robot or environment (--env.camera_name=corner2,topview for metaworld_mt), or give its name to "
+                "one that shows the same, by --rename_map."
             )
 
 

@@ -18,7 +18,6 @@ class E2EPolicy(MultiTaskPolicy):
     """Base of `e2e_bc` and `e2e_iql`. Subclasses define `actor_mean` and `forward`."""
 
     config: E2EConfig
-    observation_dim: int  # of the heads' input: image features, one-hot task, proprioception
 
     def __init__(
         self,
@@ -28,8 +27,17 @@ class E2EPolicy(MultiTaskPolicy):
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
         config.input_features = {key: config.input_features[key] for key in (*config.cameras, OBS_STATE)}
-        self.observation_dim = FEATURE_DIM + len(config.tasks) + config.state_dim
         self.encoder = ImageEncoder(config.encoder, config.image_shape)
+
+    @property
+    def observation_dim(self) -> int:
+        """Size of the heads' input: image features, one-hot task, proprioception."""
+        return FEATURE_DIM + len(self.config.tasks) + self.config.state_dim
+
+    @property
+    def task_offset(self) -> int:
+        """The one-hot task id follows the image features."""
+        return FEATURE_DIM
 
     def observation(self, images: Tensor, state: Tensor, tasks: Tensor) -> Tensor:
         """Encode the images and join the heads' input.
@@ -47,12 +55,9 @@ class E2EPolicy(MultiTaskPolicy):
             images = random_crop(images, self.config.random_crop_pad)
         return torch.cat([self.encoder(images), tasks, self.state_scaling(state)], dim=-1)
 
-    def reset(self) -> None:
-        """Nothing to reset: the policy has no memory."""
-
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """Act on the current image: the policy's mean action, clipped to the dataset's range.
+        """Act on the current image: the policy's mean action, clipped, and `action_noise`.
 
         Args:
             batch: Each camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings).
@@ -67,4 +72,5 @@ class E2EPolicy(MultiTaskPolicy):
         check_images(self.config, batch)
         images, state = camera_images(self.config, batch), batch[OBS_STATE]
         observation = self.observation(images, state, self.one_hot_tasks(batch, state.shape[0]))
-        return self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))
+        action = self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))
+        return self.with_noise(action, batch)

@@ -1,16 +1,22 @@
 """What a latent policy holds and a dataset is encoded with: a world model, or an image backbone in its place."""
 
-from typing import Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
-from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy
+from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 
-EncoderPolicy = WMRSSMPolicy | FrozenBackbonePolicy
+if TYPE_CHECKING:  # a latent policy's module imports this one
+    from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy
+    from lerobot_wm.policies.latent_policy import LatentPolicy
+    from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+
+type EncoderPolicy = WMRSSMPolicy | FrozenBackbonePolicy | LatentPolicy
 
 
 class LatentState(Protocol):
@@ -48,14 +54,20 @@ def load_encoder(path: str) -> EncoderPolicy:
     """The checkpoint of an encoder, which it holds as `.world_model`.
 
     Args:
-        path: Folder or Hub id of a wm_rssm or frozen_backbone checkpoint.
+        path: Folder of a wm_rssm or frozen_backbone checkpoint, or of a policy on latents, which has its encoder in
+            it; or its Hub id: user/name, or user/name@revision for one branch, tag or commit.
 
     Raises:
-        ValueError: It is a checkpoint of another type.
+        ValueError: The checkpoint has no encoder.
     """
-    config = PreTrainedConfig.from_pretrained(path)
-    if isinstance(config, WMRSSMConfig):
-        return WMRSSMPolicy.from_pretrained(path, config=config)
-    if isinstance(config, FrozenBackboneConfig):
-        return FrozenBackbonePolicy.from_pretrained(path, config=config)
-    raise ValueError(f"{path} is a {config.type} checkpoint; expected one of a wm_rssm or a frozen_backbone.")
+    name, revision = path, None
+    if "@" in path and not Path(path).is_dir():
+        name, revision = path.rsplit("@", 1)
+    config = PreTrainedConfig.from_pretrained(name, revision=revision)
+    of_encoder = isinstance(config, WMRSSMConfig | FrozenBackboneConfig)
+    if not of_encoder and not (isinstance(config, LatentPolicyConfig) and config.use_latent):
+        raise ValueError(
+            f"{path} is a {config.type} checkpoint with no world model in it; expected one of a wm_rssm or a "
+            "frozen_backbone, or of a policy on their latents."
+        )
+    return get_policy_class(config.type).from_pretrained(name, config=config, revision=revision)

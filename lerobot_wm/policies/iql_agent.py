@@ -1,35 +1,26 @@
-"""What `wm_iql` and `e2e_iql` share: their agent made from a configuration, and its loss on LeRobot's batches."""
+"""What `wm_iql` and `e2e_iql` share: the agent of a configuration, its rewards, and its loss on LeRobot's batches."""
 
 from typing import Any
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from torch import Tensor
+from torch import Tensor, nn
 
-from lerobot_wm.constants import DONE, OBS_STATE, REWARD
+from lerobot_wm.constants import DONE, OBS_STATE, SUCCESS
 from lerobot_wm.policies.iql_config import IQLConfig
+from lerobot_wm.policies.rewards import FrameLabel, reward_columns
 from lerobot_wm.rl.agent import IQLAgent
 
 
-def make_agent(
-    config: IQLConfig, observation_dim: int, dataset_meta: LeRobotDatasetMetadata | None
-) -> IQLAgent:
+def make_agent(config: IQLConfig, observation_dim: int) -> IQLAgent:
     """The agent of a policy, its actors' betas noted in `config` when the policy is made new.
 
     Args:
         config: The policy's configuration.
         observation_dim: O, the size of the heads' input.
-        dataset_meta: The dataset to train on; None when a checkpoint is loaded to act.
 
     Raises:
-        ValueError: The dataset has no rewards, or no actor was trained with `config.beta`.
+        ValueError: No actor was trained with `config.beta`.
     """
-    if dataset_meta is not None:
-        missing = [key for key in (REWARD, DONE) if key not in dataset_meta.features]
-        if missing:
-            raise ValueError(
-                f"{config.type} learns from rewards, but {dataset_meta.repo_id} has no {' and no '.join(missing)}: add "
-                f"them to the dataset, or train --policy.type={config.type.replace('iql', 'bc')}, which needs none."
-            )
     if not config.trained_betas:
         config.trained_betas = list(dict.fromkeys([config.beta, *config.sweep_betas]))
     if config.beta not in config.trained_betas:
@@ -50,23 +41,67 @@ def make_agent(
     )
 
 
+class Outcomes(nn.Module):
+    """What came of an action, in training: its reward, and whether it ended the task.
+
+    A task ends where `next.done` is true or, in a dataset without it, `next.success`.
+
+    Args:
+        config: The policy's configuration.
+        dataset_meta: The dataset to train on; None when a checkpoint is loaded to act.
+
+    Raises:
+        ValueError: The dataset lacks the reward, or does not tell where a task ends.
+    """
+
+    def __init__(self, config: IQLConfig, dataset_meta: LeRobotDatasetMetadata | None) -> None:
+        super().__init__()
+        end = DONE
+        if dataset_meta is not None:
+            features, known = dataset_meta.features, reward_columns(dataset_meta)
+            end = DONE if DONE in features else SUCCESS
+            missing = [] if config.reward_key in known else [config.reward_key]
+            missing += [] if end in features else [f"{DONE} or {SUCCESS}"]
+            if missing:
+                choice = f"set --policy.reward_key to one of {', '.join(known)}, " if known else ""
+                raise ValueError(
+                    f"{config.type} learns from rewards, but {dataset_meta.repo_id} has no {' and no '.join(missing)}: "
+                    f"{choice}add what is missing to the dataset, or train "
+                    f"--policy.type={config.type.replace('iql', 'bc')}, which needs none."
+                )
+        self.reward = FrameLabel(config.reward_key, dataset_meta)
+        self.end = FrameLabel(end, dataset_meta)
+
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """Rewards (B,) and ends (B,) bool."""
+        return self.reward(batch).flatten(), self.end(batch).flatten().bool()
+
+
 def batch_loss(
-    agent: IQLAgent, observation: Tensor, next_observation: Tensor, action: Tensor, batch: dict[str, Any]
+    agent: IQLAgent,
+    outcomes: Outcomes,
+    observation: Tensor,
+    next_observation: Tensor,
+    action: Tensor,
+    batch: dict[str, Any],
 ) -> tuple[Tensor, dict[str, float]]:
     """The agent's loss and its parts by name.
 
     Args:
         agent: The agent.
+        outcomes: Reads the rewards.
         observation: The heads' input at t, (B, O).
         next_observation: At t+1, (B, O).
         action: Scaled to [-1, 1], (B, A).
-        batch: `next.reward` (B,), `next.done` (B,), `observation.state_is_pad` (B, 2) at t and t+1.
+        batch: `next.reward` (B,) and `next.done` (B,), or `index` (B,) where other columns are read in their place;
+            `observation.state_is_pad` (B, 2) at t and t+1.
     """
+    reward, terminal = outcomes(batch)  # (B,) each
     return agent.loss(
         observation,
         next_observation,
         action,
-        reward=batch[REWARD].flatten(),
-        terminal=batch[DONE].flatten().bool(),
+        reward=reward,
+        terminal=terminal,
         has_next=~batch[f"{OBS_STATE}_is_pad"][:, 1],
     )

@@ -4,10 +4,11 @@ from dataclasses import dataclass, field
 
 from lerobot_wm.policies.multi_task_config import MultiTaskConfig
 from lerobot_wm.policies.optim import ActorCosineConfig
+from lerobot_wm.policies.rewards import RewardConfig
 
 
 @dataclass
-class IQLConfig(MultiTaskConfig):
+class IQLConfig(RewardConfig, MultiTaskConfig):
     """The paper's IQL settings (section 3.1.2), the rest from the IQL reference implementation.
 
     It comes first among the base classes of a policy's configuration: it sets the schedule and the frames read.

@@ -21,6 +21,8 @@ class LatentPolicyConfig(ImagePolicyConfig, MultiTaskConfig):
         use_latent: False leaves the latent out: the blind control, proprioception and task id only.
         use_environment_state: True adds the simulator's full state, `observation.environment_state`: with
             `use_latent=false` the control that is given the truth. The environment has to emit it.
+        save_predicted_video: True has `lerobot-eval` write, beside its videos, one of each batch of rollouts
+            (`pred_episode_N.mp4`): what the world model expected to see at every step, and on its right what it saw.
         rssm, frozen_backbone: What kind of encoder the policy holds, one of the two; taken from its checkpoint.
         image_key, world_model_fingerprint: Taken from that checkpoint when the policy is made.
     """
@@ -28,6 +30,7 @@ class LatentPolicyConfig(ImagePolicyConfig, MultiTaskConfig):
     world_model_path: str | None = None
     use_latent: bool = True
     use_environment_state: bool = False
+    save_predicted_video: bool = False
     rssm: RSSMConfig | None = None
     frozen_backbone: BackboneConfig | None = None
     world_model_fingerprint: str | None = None
@@ -61,9 +64,15 @@ class LatentPolicyConfig(ImagePolicyConfig, MultiTaskConfig):
         """Check that what the policy reads is there and fits the frozen world model.
 
         Raises:
-            ValueError: A feature is missing, or the action has another size than the world model's.
+            ValueError: A feature is missing, the action has another size than the world model's, or
+                `save_predicted_video` is set where nothing predicts.
         """
         _ = self.state_dim, self.env_state_dim
+        if self.save_predicted_video and self.rssm is None:
+            raise ValueError(
+                f"--policy.save_predicted_video=true, but this {self.type} has no world model that predicts images (it "
+                "has an image backbone, or no latents): leave the flag out, or take a policy on a wm_rssm's latents."
+            )
         if self.rssm is not None and self.rssm.action_dim != self.action_dim:
             raise ValueError(
                 f"The world model was trained with {self.rssm.action_dim}-d actions, this dataset or environment has "

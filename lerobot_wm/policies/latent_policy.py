@@ -1,19 +1,23 @@
 """A policy on the latents of a frozen world model: in training it reads them, at test time it filters images."""
 
+import math
 from typing import Any
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
+from torchvision.utils import make_grid
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.nn.normalize import Affine
-from lerobot_wm.policies.cameras import camera_images, check_images
+from lerobot_wm.policies.cameras import camera_images, check_images, side_by_side
 from lerobot_wm.policies.features import stat
 from lerobot_wm.policies.frozen_encoder import LatentState
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.latent_setup import adopt_encoder, check_latents, deployed_features, make_encoder
 from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
+from lerobot_wm.world_model.model import WorldModel
+from lerobot_wm.world_model.rssm import RSSMState
 
 
 class LatentPolicy(MultiTaskPolicy):
@@ -31,13 +35,11 @@ class LatentPolicy(MultiTaskPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         encoder = None
-        if dataset_meta is not None:  # to be trained
-            if not config.tasks:  # made new, not loaded from a checkpoint
-                if config.use_latent:
-                    encoder = adopt_encoder(config)
-                config.input_features = deployed_features(config)
-            if config.use_latent:
-                check_latents(config, dataset_meta)
+        if config.use_latent and config.rssm is None and config.frozen_backbone is None:  # made new
+            encoder = adopt_encoder(config)
+        config.input_features = deployed_features(config)
+        if config.use_latent and dataset_meta is not None:  # to be trained
+            check_latents(config, dataset_meta)
         super().__init__(config, dataset_stats, dataset_meta)
         if config.use_latent:
             self.world_model = make_encoder(config) if encoder is None else encoder
@@ -56,6 +58,11 @@ class LatentPolicy(MultiTaskPolicy):
                     stat(dataset_stats, OBS_ENV_STATE, "mean"), stat(dataset_stats, OBS_ENV_STATE, "std")
                 )
         self.reset()
+
+    @property
+    def task_offset(self) -> int:
+        """The one-hot task id follows the latent."""
+        return self.config.latent_dim
 
     def train(self, mode: bool = True) -> "LatentPolicy":
         """Switch training mode; the frozen world model stays in evaluation mode."""
@@ -110,12 +117,20 @@ class LatentPolicy(MultiTaskPolicy):
 
     def reset(self) -> None:
         """Forget the episode: the next call of `select_action` starts the filter anew."""
+        super().reset()
         self._filter_state: LatentState | None = None
         self._prev_action: Tensor | None = None
+        # What lerobot-eval gathers after every step and joins along dim 2, with `save_predicted_video`.
+        self.last_predicted_latents: Tensor | None = None
+
+    def act(self, state: Tensor, tasks: Tensor, latent: Tensor | None, env_state: Tensor | None) -> Tensor:
+        """The policy's mean action, clipped to the dataset's range, in its units: (B, A). Arguments: `observation`."""
+        mean = self.actor_mean(self.observation(state, tasks, latent, env_state))
+        return self.action_scaling.inverse(mean.clamp(-1, 1))
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """Filter the new image and act on the state: the policy's mean action, clipped to the dataset's range.
+        """Filter the new image and act on the state: the policy's mean action, clipped, and `action_noise`.
 
         Args:
             batch: Each camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings), and
@@ -133,9 +148,12 @@ class LatentPolicy(MultiTaskPolicy):
         latent = self._filter(batch) if self.config.use_latent else None
         env_state = self._env_state(batch) if self.config.use_environment_state else None
         tasks = self.one_hot_tasks(batch, state.shape[0])
-        mean = self.actor_mean(self.observation(state, tasks, latent, env_state))
-        self._prev_action = self.action_scaling.inverse(mean.clamp(-1, 1))
+        self._prev_action = self.with_noise(self.act(state, tasks, latent, env_state), batch)
         return self._prev_action
+
+    def decode_predicted_latents(self, frames: Tensor) -> Tensor:
+        """The video of a rollout, (T, H, W, C) uint8; LeRobot joins its `last_predicted_latents` to (1, C, T, H, W)."""
+        return frames[0].permute(1, 2, 3, 0)
 
     def _filter(self, batch: dict[str, Any]) -> Tensor:
         """Advance the filter by one frame and return s_t, (B, L)."""
@@ -152,7 +170,30 @@ class LatentPolicy(MultiTaskPolicy):
             batch[OBS_STATE][:, None],
         )
         self._filter_state = states.last()
+        if self.config.save_predicted_video:
+            self.last_predicted_latents = self._predicted_and_seen(images)
         return self._filter_state.latent
+
+    def _predicted_and_seen(self, images: Tensor) -> Tensor:
+        """What the world model expected to see, from s_{t-1} and a_{t-1}, and on its right what it saw.
+
+        They are pictures already: one of LeRobot's videos shows a whole batch, and it decodes latents alone.
+
+        Args:
+            images: o_t, (B, K·C, H, W) in [0, 1].
+
+        Returns:
+            One pair for each of the B environments, as tiles of one picture: (1, C, 1, H', W') uint8.
+        """
+        world_model, state = self.world_model, self._filter_state
+        assert isinstance(world_model, WorldModel)  # as the configuration checked
+        assert isinstance(state, RSSMState)
+        # d_t does not depend on o_t; z_t as expected without it is the prior's.
+        prior = RSSMState(state.deter, world_model.rssm.prior(state.deter).mean)
+        both = (world_model.decode(prior.latent), images)
+        pairs = torch.cat([side_by_side(image, len(self.config.cameras)) for image in both], dim=-1)
+        grid = make_grid(pairs, nrow=math.ceil(pairs.shape[0] ** 0.5))  # (C, H', W')
+        return (255 * grid).round().byte()[None, :, None]
 
     def _env_state(self, batch: dict[str, Any]) -> Tensor:
         if OBS_ENV_STATE not in batch:

@@ -12,7 +12,6 @@ from lerobot_wm.policies.features import stat
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_encoder import load_encoder
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.model import WorldModel
 
 _MIN_FEATURE_STD = 1e-5  # below it, scaling features to unit variance would scale rounding errors
@@ -29,21 +28,22 @@ def adopt_encoder(config: LatentPolicyConfig) -> WorldModel | FrozenBackbone:
             f"--policy.type={config.type} needs --policy.world_model_path=<folder or Hub id of a wm_rssm checkpoint>."
         )
     policy = load_encoder(config.world_model_path)
-    if isinstance(policy, WMRSSMPolicy):
-        config.rssm = policy.world_model.config
+    encoder = policy.world_model
+    if isinstance(encoder, WorldModel):
+        config.rssm = encoder.config
     else:
-        config.frozen_backbone = policy.world_model.config
+        config.frozen_backbone = encoder.config
     config.image_key = policy.config.image_key
     config.input_features |= {key: policy.config.input_features[key] for key in policy.config.cameras}
-    config.world_model_fingerprint = weights_fingerprint(policy.world_model)
-    return policy.world_model
+    config.world_model_fingerprint = weights_fingerprint(encoder)
+    return encoder
 
 
 def make_encoder(config: LatentPolicyConfig) -> WorldModel | FrozenBackbone:
     """The encoder a checkpoint's configuration describes, to be filled with its weights."""
     if config.rssm is not None:
         return WorldModel(config.rssm)
-    assert config.frozen_backbone is not None  # a policy with latents has one of the two
+    assert config.frozen_backbone is not None  # adopted, if it was not in the checkpoint
     return FrozenBackbone(config.frozen_backbone)
 
 
@@ -63,6 +63,8 @@ def deployed_features(config: LatentPolicyConfig) -> dict[str, PolicyFeature]:
 def check_latents(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> None:
     """Refuse a dataset without latents, with those of another world model, or with features that hold nothing.
 
+    The policy is then for cameras of the size that the latents were made from, whatever the world model was trained on.
+
     Raises:
         ValueError: Says how to encode it.
     """
@@ -74,6 +76,8 @@ def check_latents(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetada
         )
     record = LatentRecord.read(Path(dataset_meta.root))
     record.check_world_model(config.world_model_fingerprint, config.world_model_path)
+    for key, shape in record.camera_shapes.items():
+        config.input_features[key] = PolicyFeature(FeatureType.VISUAL, tuple(shape))
     if config.frozen_backbone is not None:
         std = stat(dataset_meta.stats, OBS_LATENT, "std").median().item()
         if std < _MIN_FEATURE_STD:

@@ -17,6 +17,9 @@ class MultiTaskConfig(PreTrainedConfig):
     Args:
         hidden_dims: Widths of the hidden layers of every head.
         dropout: Dropout of the actor.
+        action_noise: Standard deviation of Gaussian noise on the actions at test time, where the dataset's actions span
+            [-1, 1]. Demonstrations that were collected with noise show how to act under it, and a policy that hovers
+            where no demonstration ends gets free.
         lr: Learning rate of Adam.
         dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in.
         tasks: Task strings in one-hot order, taken from the dataset when the policy is made.
@@ -24,6 +27,7 @@ class MultiTaskConfig(PreTrainedConfig):
 
     hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
     dropout: float = 0.1
+    action_noise: float = 0.0
     lr: float = 3e-4
     dtype: str | None = None
     tasks: list[str] = field(default_factory=list)
@@ -33,6 +37,8 @@ class MultiTaskConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.action_noise < 0:
+            raise ValueError(f"action_noise is {self.action_noise:g}; a standard deviation is 0 or more.")
         if self.dtype is None:
             self.dtype = default_dtype(str(self.device))
 

@@ -1,20 +1,28 @@
 """What all policies that act have in common: the task list, and scalings of proprioception and action."""
 
-from typing import Any
+import logging
+from typing import Any, Self
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
+from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
+from lerobot_wm.policies.action_noise import ActionNoise
 from lerobot_wm.policies.features import stat
 from lerobot_wm.policies.multi_task_config import MultiTaskConfig
 from lerobot_wm.policies.pretrained import StrictPolicy
 
+logger = logging.getLogger(__name__)
+
 
 class MultiTaskPolicy(StrictPolicy):
-    """Base of the policies that act. Subclasses define `actor_mean`, `select_action` and `forward`."""
+    """Base of the policies that act.
+
+    Subclasses define `heads`, `task_offset`, `actor_mean`, `select_action` and `forward`.
+    """
 
     config: MultiTaskConfig
 
@@ -30,6 +38,7 @@ class MultiTaskPolicy(StrictPolicy):
         config.validate_features()
         self.state_scaling = Affine(config.state_dim)
         self.action_scaling = Affine(config.action_dim)
+        self._action_noise = ActionNoise(config.action_noise)
         if dataset_stats is not None:  # a checkpoint's own values replace these when it is loaded
             self.state_scaling.set_standard(
                 stat(dataset_stats, OBS_STATE, "mean"), stat(dataset_stats, OBS_STATE, "std")
@@ -38,9 +47,61 @@ class MultiTaskPolicy(StrictPolicy):
                 stat(dataset_stats, ACTION, "min"), stat(dataset_stats, ACTION, "max")
             )
 
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: Any,
+        *,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """Load a checkpoint; when it is to be trained on, make room for the dataset's new tasks. See `StrictPolicy`."""
+        policy = super().from_pretrained(pretrained_name_or_path, dataset_meta=dataset_meta, **kwargs)
+        if dataset_meta is not None:
+            policy.add_tasks([str(task) for task in dataset_meta.tasks.index])
+        return policy
+
+    def heads(self) -> list[MLP]:
+        """The networks that read the observation (B, O), and maybe more after it."""
+        raise NotImplementedError
+
+    @property
+    def task_offset(self) -> int:
+        """Where in the observation the one-hot task id begins."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def add_tasks(self, tasks: list[str]) -> None:
+        """Learn of further tasks: their places in the one-hot come after the known ones', with weights of zero.
+
+        Known tasks are acted on as before. A new one begins as what the policy does regardless of the task.
+
+        Args:
+            tasks: Task strings; known ones are passed over.
+        """
+        new = [task for task in tasks if task not in self.config.tasks]
+        if not new:
+            return
+        place = self.task_offset + len(self.config.tasks)
+        for head in self.heads():
+            head.insert_inputs(place, len(new))
+        self.config.tasks = [*self.config.tasks, *new]
+        logger.info("New tasks: %s; known ones: %s", new, self.config.tasks[: -len(new)])
+
     def actor_mean(self, observation: Tensor) -> Tensor:
         """The policy's action (B, A), scaled to [-1, 1], for observations (B, O)."""
         raise NotImplementedError
+
+    def reset(self) -> None:
+        """Forget the episode; LeRobot calls this between episodes."""
+        self._action_noise.reset()
+
+    def with_noise(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
+        """Actions (B, A) with `config.action_noise`, clipped to the dataset's range; `batch` is `select_action`'s."""
+        if self.config.action_noise == 0:
+            return action
+        noisy = self._action_noise(self.action_scaling(action), batch)  # (B, A)
+        return self.action_scaling.inverse(noisy.clamp(-1, 1))
 
     def one_hot_tasks(self, batch: dict[str, Any], batch_size: int) -> Tensor:
         """One-hot task ids (B, N) from the batch's task strings; one known task needs no string.
@@ -58,7 +119,7 @@ class MultiTaskPolicy(StrictPolicy):
         if unknown:
             raise ValueError(
                 f"Unknown task {sorted(unknown)}; this policy was trained on {known}. Use one of these strings, or "
-                "train a policy on a dataset that holds the new task."
+                "train it on, by --policy.path, with a dataset that holds the new task."
             )
         index = torch.tensor([known.index(name) for name in names], device=self.state_scaling.offset.device)
         return nn.functional.one_hot(index, len(known)).float()

@@ -1,11 +1,18 @@
 """Strict loading of checkpoints."""
 
+from copy import deepcopy
 from typing import Any, Self
 
 import torch
+from huggingface_hub import ModelCard
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from safetensors import SafetensorError
+
+from lerobot_wm.hub.model_card import TrainingData, model_card
+from lerobot_wm.policies.fine_tuning import fit_to_dataset
 
 
 class StrictPolicy(PreTrainedPolicy):
@@ -16,13 +23,37 @@ class StrictPolicy(PreTrainedPolicy):
     name = "wm"
 
     @classmethod
-    def from_pretrained(cls, pretrained_name_or_path: Any, *, strict: bool = True, **kwargs: Any) -> Self:
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: Any,
+        *,
+        config: PreTrainedConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        strict: bool = True,
+        **kwargs: Any,
+    ) -> Self:
         """Load a checkpoint from a folder or the Hub; strict unless told otherwise.
 
+        What it was trained with stays: weights, and the statistics that scale actions and proprioception. These are no
+        dataset's own once training goes on with another, but the weights were fitted to them.
+
+        Args:
+            pretrained_name_or_path: Folder or Hub id.
+            config: Its configuration, with changes; None takes the checkpoint's.
+            dataset_meta: The dataset to train it on; None to act.
+            strict: Whether weights must match to the last key.
+            **kwargs: LeRobot's, such as `revision`.
+
         Raises:
-            ValueError: Keys are missing, left over or of another shape, or weights are not finite.
+            ValueError: Keys are missing, left over or of another shape, weights are not finite, or the dataset's
+                sizes are not the checkpoint's.
         """
-        return super().from_pretrained(pretrained_name_or_path, strict=strict, **kwargs)
+        if dataset_meta is not None:
+            saved = PreTrainedConfig.from_pretrained(pretrained_name_or_path, revision=kwargs.get("revision"))
+            config = config or deepcopy(saved)
+            fit_to_dataset(config, saved, dataset_meta)
+            kwargs["dataset_meta"] = dataset_meta
+        return super().from_pretrained(pretrained_name_or_path, config=config, strict=strict, **kwargs)
 
     @classmethod
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
@@ -40,3 +71,16 @@ class StrictPolicy(PreTrainedPolicy):
                 "the training that wrote it diverged; take an earlier checkpoint."
             )
         return model
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> ModelCard:
+        """The card that LeRobot publishes with a policy it has trained; its last two arguments tell all."""
+        data = None if dataset_meta is None else TrainingData.of(dataset_meta)
+        return model_card(type(self), self.config, self.config.repo_id or model_type, cfg, data)

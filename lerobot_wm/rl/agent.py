@@ -90,6 +90,10 @@ class IQLAgent(nn.Module):
             self.actors.append(make_actor())
         orthogonal_init(self.actors[1:])
 
+    def networks(self) -> list[MLP]:
+        """All that read the observation."""
+        return [module for module in self.modules() if isinstance(module, MLP)]
+
     def param_groups(self) -> list[dict[str, Any]]:
         """Three optimizer groups, the actors first: only their learning rate decays."""
         return [{"params": list(network.parameters())} for network in (self.actors, self.critic, self.value)]

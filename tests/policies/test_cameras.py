@@ -6,13 +6,8 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_wm.policies.cameras import (
-    camera_images,
-    check_images,
-    resize_images,
-    side_by_side,
-    stack_images,
-)
+from lerobot_wm.data.resize import resize_images
+from lerobot_wm.policies.cameras import camera_images, check_images, side_by_side, stack_images
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.config import RSSMConfig
@@ -55,12 +50,9 @@ def test_cameras_are_stacked_in_the_order_given(image_key: str | None, cameras: 
         assert torch.equal(image, resize_images(batch[key], (64, 64)))
 
 
-def test_larger_images_are_averaged_down() -> None:
-    images = torch.rand(2, 5, 3, 128, 192)
-    small = resize_images(images, (64, 64))
-    assert small.shape == (2, 5, 3, 64, 64)
-    torch.testing.assert_close(small[0, 0, 0, 0, 0], images[0, 0, 0, :2, :3].mean())
-    assert stack_images([small], (64, 64)) is small
+def test_one_camera_of_the_right_size_is_not_copied() -> None:
+    images = torch.rand(2, 5, 3, 64, 64)
+    assert stack_images([images], (64, 64)) is images
 
 
 def test_pictures_stand_side_by_side() -> None:
@@ -115,3 +107,5 @@ def test_what_is_shown_is_checked_camera_by_camera() -> None:
         ValueError, match=r"right'; the observation has observation\.images\.left\. .*rename_map"
     ):
         check_images(config, {LEFT: left})
+    with pytest.raises(ValueError, match=r"right'; the observation has observation\.images\.left\."):
+        camera_images(config, {LEFT: left[:, None], f"{LEFT}_is_pad": left})

@@ -257,9 +257,9 @@ def test_it_is_not_trained(demos_root: Path, tmp_path: Path, monkeypatch: pytest
         lerobot_train.main()
 
 
-def test_a_policy_is_no_encoder(policy_path: Path) -> None:
-    with pytest.raises(ValueError, match="is a wm_bc checkpoint"):
-        load_encoder(str(policy_path))
+def test_a_policy_has_its_encoder_in_it(policy_path: Path) -> None:
+    config = load_encoder(str(policy_path)).world_model.config
+    assert isinstance(config, BackboneConfig)
 
 
 def test_a_camera_is_needed() -> None:

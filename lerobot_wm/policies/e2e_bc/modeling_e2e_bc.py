@@ -33,6 +33,10 @@ class E2EBCPolicy(E2EPolicy):
         """Every parameter: encoder and actor are trained together."""
         return list(self.parameters())  # type: ignore[return-value]  # LeRobot's annotation is narrower than its use
 
+    def heads(self) -> list[MLP]:
+        """The actor."""
+        return [self.actor]
+
     def actor_mean(self, observation: Tensor) -> Tensor:
         """The regressed action (B, A) for observations (B, O)."""
         return self.actor(observation)

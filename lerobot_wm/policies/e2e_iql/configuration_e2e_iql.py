@@ -11,7 +11,4 @@ from lerobot_wm.policies.iql_config import IQLConfig
 @PreTrainedConfig.register_subclass("e2e_iql")
 @dataclass
 class E2EIQLConfig(IQLConfig, E2EConfig):
-    """IQL from pixels with the settings of IQL on latents (paper section 3.2).
-
-    It learns from the dataset's `next.reward`, whichever reward that is.
-    """
+    """IQL from pixels with the settings of IQL on latents (paper section 3.2)."""

@@ -7,10 +7,11 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
 from lerobot_wm.policies.e2e_policy import E2EPolicy
-from lerobot_wm.policies.iql_agent import batch_loss, make_agent
+from lerobot_wm.policies.iql_agent import Outcomes, batch_loss, make_agent
 
 
 class E2EIQLPolicy(E2EPolicy):
@@ -31,12 +32,17 @@ class E2EIQLPolicy(E2EPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
-        self.agent = make_agent(config, self.observation_dim, dataset_meta)
+        self.agent = make_agent(config, self.observation_dim)
+        self.outcomes = Outcomes(config, dataset_meta)
 
     def get_optim_params(self) -> dict:
         """The agent's three groups, the actors first, and the encoder's, at a constant rate."""
         encoder = {"params": list(self.encoder.parameters())}
         return [*self.agent.param_groups(), encoder]  # type: ignore[return-value]
+
+    def heads(self) -> list[MLP]:
+        """The agent's networks."""
+        return self.agent.networks()
 
     def actor_mean(self, observation: Tensor) -> Tensor:
         """Mean of the policy's Gaussian (B, A) for observations (B, O)."""
@@ -47,7 +53,7 @@ class E2EIQLPolicy(E2EPolicy):
 
         Args:
             batch: Each camera (B, 2, C, H, W) in [0, 1] and `observation.state` (B, 2, P) at t and t+1,
-                `observation.state_is_pad` (B, 2), `action` (B, A), `next.reward` (B,), `next.done` (B,),
+                `observation.state_is_pad` (B, 2), `action` (B, A), `next.reward` and `next.done` (B,) or `index` (B,),
                 `task` (B strings).
 
         Returns:
@@ -58,7 +64,9 @@ class E2EIQLPolicy(E2EPolicy):
         now = self.observation(images[:, 0], states[:, 0], tasks)  # (B, O)
         with torch.no_grad():
             following = self.observation(images[:, 1], states[:, 1], tasks)  # (B, O)
-        return batch_loss(self.agent, now, following, self.action_scaling(batch[ACTION]), batch)
+        return batch_loss(
+            self.agent, self.outcomes, now, following, self.action_scaling(batch[ACTION]), batch
+        )
 
     def update(self) -> None:
         """Move the target critics; LeRobot calls this after every optimizer step."""

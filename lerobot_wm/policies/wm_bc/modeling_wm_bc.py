@@ -27,6 +27,10 @@ class WMBCPolicy(LatentPolicy):
         """The actor's parameters: the world model is frozen."""
         return list(self.actor.parameters())  # type: ignore[return-value]
 
+    def heads(self) -> list[MLP]:
+        """The actor."""
+        return [self.actor]
+
     def actor_mean(self, observation: Tensor) -> Tensor:
         """The regressed action (B, A) for observations (B, O)."""
         return self.actor(observation)

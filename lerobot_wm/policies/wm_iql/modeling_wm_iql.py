@@ -6,7 +6,8 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
-from lerobot_wm.policies.iql_agent import batch_loss, make_agent
+from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.policies.iql_agent import Outcomes, batch_loss, make_agent
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 
@@ -25,11 +26,16 @@ class WMIQLPolicy(LatentPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
-        self.agent = make_agent(config, config.observation_dim, dataset_meta)
+        self.agent = make_agent(config, config.observation_dim)
+        self.outcomes = Outcomes(config, dataset_meta)
 
     def get_optim_params(self) -> dict:
         """The agent's three groups, the actors first: the world model is frozen."""
         return self.agent.param_groups()  # type: ignore[return-value]  # LeRobot's annotation is narrower than its use
+
+    def heads(self) -> list[MLP]:
+        """The agent's networks."""
+        return self.agent.networks()
 
     def actor_mean(self, observation: Tensor) -> Tensor:
         """Mean of the policy's Gaussian (B, A) for observations (B, O)."""
@@ -40,7 +46,7 @@ class WMIQLPolicy(LatentPolicy):
 
         Args:
             batch: `observation.latent` (B, 2, L) and `observation.state` (B, 2, P) at t and t+1,
-                `observation.state_is_pad` (B, 2), `action` (B, A), `next.reward` (B,), `next.done` (B,),
+                `observation.state_is_pad` (B, 2), `action` (B, A), `next.reward` and `next.done` (B,) or `index` (B,),
                 `task` (B strings), and `observation.environment_state` (B, 2, F) with `use_environment_state`.
 
         Returns:
@@ -48,7 +54,9 @@ class WMIQLPolicy(LatentPolicy):
         """
         tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
         now, following = (self.observation_at(batch, tasks, t) for t in (0, 1))  # (B, O) each
-        return batch_loss(self.agent, now, following, self.action_scaling(batch[ACTION]), batch)
+        return batch_loss(
+            self.agent, self.outcomes, now, following, self.action_scaling(batch[ACTION]), batch
+        )
 
     def update(self) -> None:
         """Move the target critics; LeRobot calls this after every optimizer step."""

@@ -9,12 +9,13 @@ from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, default_dtype, feature_dim
 from lerobot_wm.policies.optim import FusedAdamConfig
+from lerobot_wm.policies.rewards import RewardConfig
 from lerobot_wm.world_model.config import RSSMConfig
 
 
 @PreTrainedConfig.register_subclass("wm_rssm")
 @dataclass
-class WMRSSMConfig(ImagePolicyConfig):
+class WMRSSMConfig(ImagePolicyConfig, RewardConfig):
     """The paper's RSSM, trained on windows of images and actions (section 3.1.1).
 
     Several cameras are one image of more channels to it. Its error is summed over them all, so that each camera adds
@@ -67,6 +68,11 @@ class WMRSSMConfig(ImagePolicyConfig):
     def reward_delta_indices(self) -> list[int]:
         """Frames of a window, relative to its first."""
         return list(range(self.window_length))
+
+    @property
+    def features_read(self) -> list[str]:
+        """Cameras, and proprioception where it is modelled."""
+        return [*self.cameras, *([OBS_STATE] if self.rssm.use_proprio else [])]
 
     @property
     def image_size(self) -> tuple[int, int]:

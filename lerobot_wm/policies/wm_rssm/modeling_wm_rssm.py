@@ -10,6 +10,7 @@ from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
 from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.features import stat
 from lerobot_wm.policies.pretrained import StrictPolicy
+from lerobot_wm.policies.rewards import FrameLabel, reward_columns
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.world_model.model import WorldModel
 
@@ -31,13 +32,16 @@ class WMRSSMPolicy(StrictPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config)
+        made_new = config.rssm.action_dim == 0
         config.validate_features()
+        self._learns_reward = config.rssm.predict_reward
         if dataset_meta is not None:  # to be trained
             config.fit_windows(min(dataset_meta.episodes["length"]))
-            if REWARD not in dataset_meta.features:
-                config.rssm.predict_reward = (
-                    False  # nothing to predict; the model is trained without the head
-                )
+            if not self._has_reward(dataset_meta):
+                self._learns_reward = False
+                if made_new:
+                    config.rssm.predict_reward = False  # without the head; a checkpoint's stays as it was
+        self.rewards = FrameLabel(config.reward_key, dataset_meta)
         self.world_model = WorldModel(config.rssm)
         if dataset_stats is not None:  # a checkpoint's own values replace these when it is loaded
             self.world_model.action_scaling.set_range(
@@ -48,6 +52,16 @@ class WMRSSMPolicy(StrictPolicy):
                     stat(dataset_stats, OBS_STATE, "mean"), stat(dataset_stats, OBS_STATE, "std")
                 )
 
+    def _has_reward(self, dataset_meta: LeRobotDatasetMetadata) -> bool:
+        """Whether there is a reward to predict; a column that was asked for must be there."""
+        key, known = self.config.reward_key, reward_columns(dataset_meta)
+        if key not in known and key != REWARD:
+            raise ValueError(
+                f"--policy.reward_key={key}: {dataset_meta.repo_id} has no such column; of one number per frame it has "
+                f"{', '.join(known) or 'none'}. Name one of these, or {REWARD}: where that is missing, none is learned."
+            )
+        return key in known
+
     def get_optim_params(self) -> dict:
         """Every parameter: the whole world model is trained."""
         return list(self.parameters())  # type: ignore[return-value]  # LeRobot's annotation is narrower than its use
@@ -57,7 +71,7 @@ class WMRSSMPolicy(StrictPolicy):
 
         Args:
             batch: Each camera (B, T, C, H, W) in [0, 1], `action` (B, T, A), `action_is_pad` (B, T), and
-                `next.reward` (B, T), `observation.state` (B, T, P) where the configuration uses them.
+                `next.reward` (B, T) or `index` (B,), `observation.state` (B, T, P) where the configuration uses them.
 
         Returns:
             The scalar loss and its parts by name.
@@ -67,7 +81,7 @@ class WMRSSMPolicy(StrictPolicy):
             images=camera_images(self.config, batch),
             actions=batch[ACTION],
             valid=~batch[f"{ACTION}_is_pad"],
-            rewards=batch[REWARD] if rssm.predict_reward else None,
+            rewards=self.rewards(batch, batch[ACTION].shape[1]) if self._learns_reward else None,
             proprio=batch[OBS_STATE] if rssm.use_proprio else None,
         )
         values = torch.stack(list(parts.values())).tolist()  # one transfer from the device for all of them

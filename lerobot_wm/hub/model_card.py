@@ -1,0 +1,131 @@
+"""The model card of our policy types: what it is, how it was trained, how well it does, how to use it."""
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Self
+
+import draccus
+from huggingface_hub import ModelCard, ModelCardData
+from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+from lerobot_wm.constants import ACTION, OBS_LATENT, OBS_STATE, TASK
+from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.hub.markdown import Markdown, render
+from lerobot_wm.hub.train_command import train_command
+from lerobot_wm.nn.conv import IMAGE_SIZE
+
+PACKAGES = ("lerobot_policy_wm", "lerobot", "torch")
+IMAGINATION = "imagination.webp"  # beside the card, where there is one
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """What a card says of the dataset a policy was trained on.
+
+    Attributes:
+        repo_id: Its name.
+        episodes, frames: How many.
+        tasks: Its task strings.
+        fingerprint: `dataset_fingerprint` of it.
+        latents: Their record, where it holds latents.
+    """
+
+    repo_id: str
+    episodes: int
+    frames: int
+    tasks: list[str]
+    fingerprint: str
+    latents: LatentRecord | None
+
+    @classmethod
+    def of(cls, meta: LeRobotDatasetMetadata) -> Self:
+        """Read it from a dataset on this machine."""
+        root = Path(meta.root)
+        return cls(
+            repo_id=meta.repo_id,
+            episodes=meta.total_episodes,
+            frames=meta.total_frames,
+            tasks=[str(task) for task in meta.tasks.index],
+            fingerprint=dataset_fingerprint(root),
+            latents=LatentRecord.read(root) if OBS_LATENT in meta.features else None,
+        )
+
+
+def model_card(
+    policy_class: type,
+    config: PreTrainedConfig,
+    repo_id: str,
+    cfg: TrainPipelineConfig | None,
+    data: TrainingData | None,
+    results: str | None = None,
+    imagined_tasks: list[str] | None = None,
+) -> ModelCard:
+    """Write the card.
+
+    Args:
+        policy_class: Of the policy.
+        config: Its configuration.
+        repo_id: Where it is published.
+        cfg: Of the run that trained it; None where that is not known.
+        data: What it was trained on; None where that is not on this machine.
+        results: Tables of an evaluation, in Markdown.
+        imagined_tasks: What the columns of `IMAGINATION` show, which is published with the card; None where there is
+            no such file.
+    """
+    settings = draccus.encode(config)
+    datasets = [data.latents.source_repo_id if data.latents else data.repo_id] if data else None
+    metadata = ModelCardData(
+        license=config.license or "apache-2.0",
+        library_name="lerobot",
+        pipeline_tag="robotics",
+        tags=sorted({"robotics", "lerobot", "lerobot_wm", config.type, *(config.tags or [])}),
+        datasets=datasets,
+    )
+    body = render(
+        "model_card.md.j2",
+        type=config.type,
+        settings=settings,
+        repo_id=repo_id,
+        module=policy_class.__module__,
+        class_name=policy_class.__name__,
+        example=Markdown(_example(config, settings)),
+        action_shape=(1, *config.output_features[ACTION].shape),
+        inputs=_inputs(config, settings),
+        run=cfg,
+        command=Markdown(train_command(cfg, data.latents if data else None)) if cfg else None,
+        data=data,
+        versions={package: version(package) for package in PACKAGES},
+        results=None if results is None else Markdown(results),
+        imagination=IMAGINATION,
+        imagined_tasks=imagined_tasks,
+    )
+    return ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n{body}")
+
+
+def _inputs(config: PreTrainedConfig, settings: dict) -> dict[str, tuple[int, ...]]:
+    """Shapes of what the policy reads; a world model's configuration keeps all that its dataset has."""
+    features = config.input_features
+    if config.type == "wm_rssm":
+        state = [OBS_STATE] if settings["rssm"]["use_proprio"] else []
+        features = {key: features[key] for key in [*settings["image_key"].split(","), *state]}
+    return {key: tuple(feature.shape) for key, feature in features.items()}
+
+
+def _example(config: PreTrainedConfig, settings: dict) -> str:
+    """A line of Python that makes inputs of the right shapes."""
+    if config.type == "wm_rssm":
+        rssm = settings["rssm"]
+        shapes = [(1, 5, rssm["image_channels"], IMAGE_SIZE, IMAGE_SIZE), (1, 5, rssm["action_dim"])]
+        proprio = f", torch.zeros(1, 5, {rssm['proprio_dim']})" if rssm["use_proprio"] else ""
+        return f"inputs = (torch.rand{shapes[0]}, torch.zeros{shapes[1]}{proprio})  # 5 images, a_t at each"
+    batch = [
+        f"{key!r}: torch.{'rand' if feature.type is FeatureType.VISUAL else 'zeros'}{(1, *feature.shape)}"
+        for key, feature in config.input_features.items()
+    ]
+    if settings.get("tasks"):
+        batch.append(f"{TASK!r}: {settings['tasks'][:1]!r}")
+    return f"batch = {{{', '.join(batch)}}}  # images in [0, 1]"

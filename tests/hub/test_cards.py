@@ -1,0 +1,117 @@
+"""Cards hold what they are given, whatever it is named."""
+
+from pathlib import Path
+
+import pytest
+from huggingface_hub import ModelCard
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies.factory import get_policy_class
+from markdown_it import MarkdownIt
+
+from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.hub.markdown import code, escaped
+from lerobot_wm.hub.model_card import TrainingData, model_card
+from lerobot_wm.hub.train_command import train_command
+from lerobot_wm.pipeline.publish import check_records
+from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+from lerobot_wm.report.records import Record
+
+NASTY = [
+    "---\nlicense: mit\n---",
+    "a | b",
+    "<img src=x>",
+    "`rm -rf`",
+    "**bold** [link](http://x)",
+    'it\'s "quoted"',
+]
+RECORD: Record = {
+    "arm": "wm_bc",
+    "policy_type": "wm_bc",
+    "preset": "test",
+    "seed": 0,
+    "task": "reach-v3",
+    "variation": 0,
+    "seen": True,
+    "success": True,
+    "steps": 1,
+    "return": 1.0,
+}
+
+
+def html(markdown: str) -> str:
+    return MarkdownIt("gfm-like", {"linkify": False}).render(markdown)
+
+
+@pytest.mark.parametrize("text", [*NASTY, "snake_case _edge_ ~x~ # y"])
+def test_text_is_shown_as_it_is(text: str) -> None:
+    shown = html(f"| x |\n|---|\n| {escaped(text)} |\n")
+    plain = " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    assert f"<td>{plain.replace(chr(34), '&quot;')}</td>" in shown
+    assert escaped("snake_case") == "snake_case"
+    assert html(f"| x |\n|---|\n| {code(text)} |\n").count("<td><code>") == 1
+
+
+def test_no_name_breaks_a_card() -> None:
+    config = WMRSSMConfig(device="cpu", image_key="observation.image")
+    config.input_features = features("VISUAL", "observation.image", (3, 64, 64))
+    config.output_features = features("ACTION", "action", (4,))
+    run = TrainPipelineConfig(dataset=DatasetConfig(repo_id="user/x"), policy=config)
+    data = TrainingData("user/x", 2, 100, NASTY, "0123456789abcdef", None)
+    card = model_card(get_policy_class("wm_rssm"), config, "user/wm", run, data, imagined_tasks=NASTY)
+    again = ModelCard(str(card))
+    assert again.data.license == "apache-2.0"
+    shown = html(again.text)
+    assert "<img src=x>" not in shown
+    assert "<strong>bold</strong>" not in shown
+    [row] = [line for line in again.text.splitlines() if line.startswith("| tasks |")]
+    assert "<table>" in shown
+    assert len(html(f"| | |\n|---|---|\n{row}\n").split("<td>")) == 3
+
+
+def features(kind: str, key: str, shape: tuple[int, ...]) -> dict:
+    return {key: PolicyFeature(FeatureType[kind], shape)}
+
+
+def test_the_command_trains_the_same_and_tells_no_place(tmp_path: Path) -> None:
+    policy = WMBCConfig(
+        device="cpu", world_model_path=str(tmp_path), dropout=0.3, hidden_dims=[64], tasks=NASTY
+    )
+    policy.world_model_fingerprint, policy.repo_id = "abc", "user/wm_bc"
+    run = TrainPipelineConfig(
+        dataset=DatasetConfig(repo_id="user/latents", root=str(tmp_path), revision="v1"),
+        policy=policy,
+        output_dir=tmp_path,
+        batch_size=7,
+        steps=11,
+        seed=5,
+    )
+    command = train_command(run, None)
+    assert command == (
+        "lerobot-wm train --policy.type=wm_bc '--policy.hidden_dims=[64]' --policy.dropout=0.3 "
+        "--policy.world_model_path=WORLD_MODEL --dataset.repo_id=user/latents --dataset.revision=v1 "
+        "--batch_size=7 --steps=11 --seed=5"
+    )
+    source = LatentRecord("abc", "user/images", "def", NASTY, False)
+    assert "--dataset.repo_id=user/images --batch_size" in train_command(run, source)
+    policy.world_model_path, policy.pretrained_path = "user/wm@v1", tmp_path
+    assert "--policy.world_model_path=user/wm@v1" in train_command(run, None)
+    assert train_command(run, None).startswith("lerobot-wm train --policy.path=CHECKPOINT ")
+    run.resume = True
+    assert train_command(run, None).startswith("lerobot-wm train --policy.type=wm_bc ")
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({"arm": "wm_iql"}, "arms wm_bc, wm_iql"),
+        ({"policy_type": "wm_iql"}, "wm_iql with"),
+        ({"seed": 1}, "seed 1"),
+    ],
+)
+def test_records_of_another_policy_are_refused(other: dict, said: str) -> None:
+    check_records([RECORD], "wm_bc", 0)
+    with pytest.raises(ValueError, match=said):
+        check_records([RECORD, {**RECORD, **other}], "wm_bc", 0)

@@ -1,0 +1,58 @@
+"""What cannot be pulled or pushed ends in one line that says what was found and how to mend it."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.hub.conftest import Machine
+from tests.hub.server import Hub, Repo
+
+TRAIN = "train --policy.type=wm_rssm --policy.device=cpu --steps=1 --num_workers=0 --output_dir={folder}/run"
+ENCODE = (
+    "encode --output_repo_id=user/x --output_root={folder}/x --dataset.repo_id=user/demos --world_model_path="
+)
+EVAL = "eval --env.type=metaworld_mt --env.task=reach-v3 --eval.n_episodes=1 --output_dir={folder}/eval --policy.path="
+
+
+@pytest.fixture(scope="module")
+def odd_repositories(hub: Hub) -> None:
+    """A dataset whose upload was interrupted before its version was tagged, and a private model."""
+    repo = hub.repos["dataset", "user/half"] = Repo(private=False)
+    hub.commit(repo, "main", {"data/chunk-000/file-000.parquet": hub.store(b"")})
+    hub.repos["model", "user/secret"] = Repo(private=True)
+
+
+@pytest.mark.usefixtures("world_model_commit", "odd_repositories")
+@pytest.mark.parametrize(
+    ("command", "token", "said"),
+    [
+        # What is asked for is not there.
+        (
+            f"{TRAIN} --policy.push_to_hub=false --dataset.repo_id=user/nothing",
+            "",
+            "no dataset user/nothing on the Hub",
+        ),
+        (f"{ENCODE}user/wm --dataset.revision=v9", "write-user", "it has the versions v3.0"),
+        (f"{ENCODE}user/wm --dataset.revision=nope", "write-user", "user/demos has no revision 'nope'"),
+        (f"{ENCODE}user/wm --dataset.repo_id=user/half", "write-user", "its upload did not finish"),
+        (f"{ENCODE}user/wm@v9", "write-user", "model user/wm has no revision 'v9'"),
+        (f"{ENCODE}outputs/no/such/folder", "write-user", "not a folder on this machine"),
+        (f"{EVAL}user/nothing", "", "no model user/nothing on the Hub"),
+        ("publish --policy.path={folder} --repo_id=user/x", "write-user", "holds no train_config.json"),
+        # The token does not do.
+        (f"{ENCODE}user/wm", "wrong-token", "Invalid credentials"),
+        (f"{ENCODE}user/secret", "", "or it is private"),
+        (f"{TRAIN} --dataset.repo_id=user/demos --policy.repo_id=user/x", "", "there is none: log in"),
+        ("collect --repo_id=else/x --root={folder}/x --push_to_hub=true", "write-user", "belongs to else"),
+        (f"{ENCODE}user/wm --push_to_hub=true", "read-user", "may only read"),
+        ("publish --policy.path={folder} --repo_id=user/x", "", "pushing to user/x needs a token"),
+    ],
+)
+def test_one_line(command: str, token: str, said: str, machine: Machine, tmp_path: Path) -> None:
+    command = command.format(folder=tmp_path)
+    result = machine.run(command, token=token, empty_home=True)
+    assert result.status == 1
+    assert "Traceback" not in result.output
+    assert result.lines[-1].startswith(f"lerobot-wm {command.split()[0]}: ")
+    assert said in result.lines[-1]
+    assert not (tmp_path / "run" / "checkpoints").exists()

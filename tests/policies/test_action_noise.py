@@ -1,0 +1,81 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import get_policy_class
+from torch import Tensor
+
+from lerobot_wm.policies.action_noise import ActionNoise
+from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
+
+STD = 0.3
+
+
+def batch_of(rows: list[float]) -> dict[str, Any]:
+    return {"observation.state": torch.tensor(rows)[:, None], "task": ["a"] * len(rows)}
+
+
+def noise_of(rows: list[float], n_steps: int) -> Tensor:
+    """Noise of rollouts that start with these states, (T, B, A)."""
+    noise = ActionNoise(STD)
+    first, later = batch_of(rows), batch_of([9.0] * len(rows))
+    zero = torch.zeros(len(rows), 4)
+    return torch.stack([noise(zero, first if step == 0 else later) for step in range(n_steps)])
+
+
+def test_each_rollout_has_its_own_noise_whatever_else_is_in_the_batch() -> None:
+    torch.manual_seed(0)
+    together = noise_of([0.0, 1.0, 2.0], 5)
+    torch.manual_seed(1)
+    for i, row in enumerate([0.0, 1.0, 2.0]):
+        assert torch.equal(noise_of([row], 5)[:, 0], together[:, i])
+    assert not torch.equal(together[:, 0], together[:, 1])
+    assert not torch.equal(together[0], together[1])
+
+
+def test_noise_is_gaussian_with_the_given_deviation() -> None:
+    noise = noise_of([0.0, 1.0], 4000)
+    assert noise.mean().abs() < 0.01
+    assert noise.std(dim=(0, 1)).tolist() == pytest.approx([STD] * 4, rel=0.03)
+    correlation = torch.corrcoef(torch.cat([noise[:, 0], noise[:, 1]], dim=1).T) - torch.eye(8)
+    assert correlation.abs().max() < 0.08
+
+
+def load(path: Path, policy_type: str, std: float) -> MultiTaskPolicy:
+    config = PreTrainedConfig.from_pretrained(path)
+    config.action_noise = std
+    return get_policy_class(policy_type).from_pretrained(path, config=config)
+
+
+@pytest.mark.parametrize("policy_type", ["wm_bc", "wm_iql"])
+def test_policies_act_with_noise_within_the_dataset_s_range(
+    policy_paths: dict[str, Path], demos: LeRobotDataset, policy_type: str
+) -> None:
+    exact, noisy = (load(policy_paths[policy_type], policy_type, std) for std in (0.0, STD))
+    low, high = (torch.as_tensor(demos.meta.stats["action"][key]) for key in ("min", "max"))
+    differences = []
+    for index in range(10):
+        item = demos[index]
+        batch = {key: item[key][None] for key in ("observation.image", "observation.state")}
+        batch["task"] = [item["task"]]
+        action = noisy.select_action(batch)
+        assert torch.equal(noisy._prev_action, action)  # the filter reads what was executed
+        assert (action >= low - 1e-6).all()
+        assert (action <= high + 1e-6).all()
+        differences.append(action - exact.select_action(batch))
+    assert 0.1 < torch.stack(differences).std() < 0.6
+    noisy.reset()
+    first = {key: demos[0][key][None] for key in ("observation.image", "observation.state")}
+    repeated = noisy.select_action({**first, "task": [demos[0]["task"]]})
+    exact.reset()
+    torch.testing.assert_close(
+        repeated - exact.select_action({**first, "task": [demos[0]["task"]]}), differences[0]
+    )
+
+
+def test_negative_noise_is_refused() -> None:
+    with pytest.raises(ValueError, match="0 or more"):
+        get_policy_class("wm_bc").config_class(action_noise=-0.1)

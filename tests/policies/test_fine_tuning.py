@@ -1,0 +1,275 @@
+"""Training that goes on from a checkpoint, with another dataset: other tasks, other camera sizes, no reward."""
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import PreTrainedPolicy, make_policy
+from lerobot.policies.factory import get_policy_class, make_policy_config
+from lerobot.scripts import lerobot_train
+from safetensors.torch import load_file
+from torch import nn
+
+from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.pipeline.encode import encode_to_cache
+from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
+from tests.recording import FRONT, WRIST, camera, record, vector
+
+Command = Callable[..., None]
+CHECKPOINT = Path("checkpoints", "last", "pretrained_model")
+ACTING = ("wm_bc", "wm_iql", "e2e_bc", "e2e_iql")
+SHORT = "--steps=1 --batch_size=4 --log_freq=1"
+
+
+def features(front: tuple[int, int] = (48, 64), state: int = 5, action: int = 3) -> dict[str, dict[str, Any]]:
+    return {
+        FRONT: camera(*front),
+        WRIST: camera(32, 32),
+        "observation.state": vector(state),
+        "action": vector(action),
+    }
+
+
+REWARDS = {"next.reward": vector(1), "next.done": vector(1, "bool")}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fine_tuning")
+
+
+@pytest.fixture(scope="module")
+def known(folder: Path) -> LeRobotDataset:
+    """What the checkpoints are trained on."""
+    return record(folder / "known", {**features(), **REWARDS}, [("Reach", 6), ("Push", 8)])
+
+
+@pytest.fixture(scope="module")
+def other(folder: Path) -> LeRobotDataset:
+    """One task of before and a new one, the first camera of another size, other ranges of numbers."""
+    return record(folder / "other", {**features((60, 40)), **REWARDS}, [("Wave", 5), ("Push", 9)])
+
+
+def on(dataset: LeRobotDataset) -> str:
+    return f"{TRAIN_FLAGS} --dataset.repo_id=test/recorded --dataset.root={dataset.root}"
+
+
+@pytest.fixture(scope="module")
+def encoded(
+    folder: Path, known: LeRobotDataset, other: LeRobotDataset, lerobot_wm_command: Command
+) -> tuple[Path, Callable[[LeRobotDataset], LeRobotDataset]]:
+    """A world model that has seen the known dataset's cameras, and what encodes a dataset with it, once."""
+    lerobot_wm_command(
+        f"init --policy.type=wm_rssm {SMALL_WORLD_MODEL} --policy.window_length=4 --policy.device=cpu",
+        f"--dataset.repo_id=test/recorded --dataset.root={known.root} --output_dir={folder / 'wm_rssm'}",
+    )
+    path = folder / "wm_rssm" / "pretrained_model"
+
+    def encode(dataset: LeRobotDataset) -> LeRobotDataset:
+        meta = LeRobotDatasetMetadata("test/recorded", root=dataset.root)
+        return LeRobotDataset("test/latents", root=encode_to_cache(str(path), "test/recorded", meta, "cpu"))
+
+    return path, encode
+
+
+@pytest.fixture(scope="module")
+def checkpoints(
+    folder: Path, known: LeRobotDataset, encoded: tuple, lerobot_wm_command: Command
+) -> dict[str, Path]:
+    """A checkpoint of every type that is trained."""
+    world_model_path, encode = encoded
+    paths = {"wm_rssm": world_model_path}
+    for policy_type in ACTING:
+        on_latents = policy_type.startswith("wm")
+        options = f"--policy.world_model_path={world_model_path}" if on_latents else ""
+        dataset = encode(known) if on_latents else known
+        lerobot_wm_command(
+            f"init --policy.type={policy_type} --policy.device=cpu {options} --output_dir={folder / policy_type}",
+            f"--dataset.repo_id={dataset.repo_id} --dataset.root={dataset.root}",
+        )
+        paths[policy_type] = folder / policy_type / "pretrained_model"
+    return paths
+
+
+def load(path: Path) -> PreTrainedPolicy:
+    return get_policy_class(PreTrainedConfig.from_pretrained(path).type).from_pretrained(path)
+
+
+def go_on(path: Path, dataset: LeRobotDataset) -> PreTrainedPolicy:
+    """The policy that LeRobot's training commands train with `--policy.path`."""
+    config = PreTrainedConfig.from_pretrained(path)
+    config.pretrained_path = path
+    return make_policy(config, ds_meta=dataset.meta)
+
+
+def act(policy: PreTrainedPolicy, dataset: LeRobotDataset, task: str) -> torch.Tensor:
+    """Two steps of an episode."""
+    policy.reset()
+    actions = []
+    for index in (0, 1):
+        batch = {key: dataset[index][key][None] for key in (FRONT, WRIST, "observation.state")}
+        actions.append(policy.select_action({**batch, "task": [task]}))
+    return torch.cat(actions)
+
+
+@pytest.mark.parametrize("policy_type", ACTING)
+def test_new_tasks_come_after_the_known_ones(
+    policy_type: str, checkpoints: dict[str, Path], encoded: tuple, other: LeRobotDataset, tmp_path: Path
+) -> None:
+    """Known tasks are acted on as before, until training changes that."""
+    dataset = encoded[1](other) if policy_type.startswith("wm") else other
+    before, after = load(checkpoints[policy_type]), go_on(checkpoints[policy_type], dataset)
+    assert isinstance(after, MultiTaskPolicy)
+    assert before.config.tasks == ["Reach", "Push"]
+    assert after.config.tasks == ["Reach", "Push", "Wave"]
+    for scaling in ("state_scaling", "action_scaling"):
+        for name in ("offset", "scale"):
+            assert torch.equal(*(getattr(getattr(p, scaling), name) for p in (before, after)))
+    # It is made for the new dataset's camera now; have the old one take its frames too.
+    assert after.config.input_features[FRONT].shape == (3, 60, 40)
+    assert after.config.image_size == before.config.image_size
+    before.config.input_features = after.config.input_features
+    for task in ("Reach", "Push"):
+        torch.testing.assert_close(act(after, other, task), act(before, other, task), atol=1e-6, rtol=1e-6)
+    place = after.task_offset + 2
+    for old, new in zip(before.heads(), after.heads(), strict=True):
+        first = [
+            next(layer for layer in head.modules() if isinstance(layer, nn.Linear)) for head in (old, new)
+        ]
+        assert first[1].in_features == first[0].in_features + 1 == first[1].weight.shape[1]
+        assert first[1].weight.requires_grad == first[0].weight.requires_grad
+        assert not first[1].weight[:, place].any()
+    after.save_pretrained(tmp_path)
+    assert torch.equal(act(load(tmp_path), other, "Wave"), act(after, other, "Wave"))
+
+
+def test_a_fine_tuned_run_is_resumed_exactly(
+    checkpoints: dict[str, Path], other: LeRobotDataset, tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    run = tmp_path / "e2e_bc"
+    lerobot_wm_command(
+        f"train --policy.path={checkpoints['e2e_bc']} --steps=2 --save_freq=1 --batch_size=4 --log_freq=1 {on(other)}",
+        f"--output_dir={run}",
+    )
+    whole = load_file(run / CHECKPOINT / "model.safetensors")
+    shutil.rmtree(run / "checkpoints" / "000002")
+    config = run / "checkpoints" / "000001" / "pretrained_model" / "train_config.json"
+    lerobot_wm_command(f"train --config_path={config} --resume=true --output_dir={run}")
+    resumed = load_file(run / "checkpoints" / "000002" / "pretrained_model" / "model.safetensors")
+    assert whole.keys() == resumed.keys()
+    assert not [name for name, tensor in whole.items() if not torch.equal(tensor, resumed[name])]
+
+
+@pytest.mark.parametrize("policy_type", ["wm_rssm", "wm_bc", "e2e_iql"])
+def test_plain_lerobot_train(
+    policy_type: str,
+    checkpoints: dict[str, Path],
+    other: LeRobotDataset,
+    tmp_path: Path,
+    lerobot_wm_command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = on(other)
+    if policy_type == "wm_bc":  # its checkpoint has the world model that makes its latents
+        lerobot_wm_command(
+            f"encode --world_model_path={checkpoints['wm_bc']} --device=cpu --dataset.repo_id=test/recorded",
+            f"--dataset.root={other.root} --output_repo_id=test/latents --output_root={tmp_path / 'latents'}",
+        )
+        data = f"{TRAIN_FLAGS} --dataset.repo_id=test/latents --dataset.root={tmp_path / 'latents'}"
+    run = tmp_path / policy_type
+    flags = f"--policy.path={checkpoints[policy_type]} {SHORT} {data} --output_dir={run}"
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags.split()])
+    lerobot_train.main()
+    policy = load(run / CHECKPOINT)
+    assert policy.config.input_features[FRONT].shape == (3, 60, 40)
+    if policy_type != "wm_rssm":
+        assert policy.config.tasks == ["Reach", "Push", "Wave"]
+        assert not torch.equal(act(policy, other, "Wave"), act(policy, other, "Push"))
+
+
+def test_our_command_encodes_with_the_checkpoints_own_world_model(
+    checkpoints: dict[str, Path], other: LeRobotDataset, tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    copy = tmp_path / "published"
+    shutil.copytree(checkpoints["wm_iql"], copy)
+    config = copy / "config.json"
+    config.write_text(config.read_text().replace(str(checkpoints["wm_rssm"]), "gone"))
+    lerobot_wm_command(f"train --policy.path={copy} {SHORT} {on(other)} --output_dir={tmp_path / 'run'}")
+    policy = load(tmp_path / "run" / CHECKPOINT)
+    assert policy.config.tasks == ["Reach", "Push", "Wave"]
+    assert act(policy, other, "Wave").shape == (2, 3)
+
+
+def test_a_world_model_of_other_cameras_under_a_new_policy(
+    encoded: tuple, other: LeRobotDataset, checkpoints: dict[str, Path]
+) -> None:
+    """The policy is for the cameras that its latents were made from."""
+    config = make_policy_config("wm_bc", world_model_path=str(checkpoints["wm_rssm"]), device="cpu")
+    policy = make_policy(config, ds_meta=encoded[1](other).meta).eval()
+    assert act(policy, other, "Wave").shape == (2, 3)
+
+
+def test_a_world_model_goes_on_without_rewards(
+    checkpoints: dict[str, Path], folder: Path, tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    """Its reward head stays as it was, and the rest is trained."""
+    dataset = record(tmp_path / "dataset", features(), [("Wave", 6)])
+    lerobot_wm_command(
+        f"train --policy.path={checkpoints['wm_rssm']} {SHORT} {on(dataset)} --output_dir={tmp_path / 'run'}"
+    )
+    before, after = (
+        load_file(path / "model.safetensors")
+        for path in (checkpoints["wm_rssm"], tmp_path / "run" / CHECKPOINT)
+    )
+    assert before.keys() == after.keys()
+    changed = {name for name, tensor in before.items() if not torch.equal(tensor, after[name])}
+    assert not [name for name in changed if "reward_head" in name or "scaling" in name]
+    assert "world_model.encoder.layers.0.weight" in changed
+    assert WMRSSMPolicy.from_pretrained(tmp_path / "run" / CHECKPOINT).config.rssm.predict_reward
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "key", "size"),
+    [
+        ("wm_rssm", "action", 7),
+        ("wm_bc", "action", 7),
+        ("wm_bc", "state", 9),
+        ("e2e_bc", "action", 7),
+        ("e2e_iql", "state", 9),
+    ],
+)
+def test_other_sizes_are_refused(
+    policy_type: str, key: str, size: int, checkpoints: dict[str, Path], tmp_path: Path
+) -> None:
+    dataset = record(tmp_path / "dataset", {**features(**{key: size}), **REWARDS}, [("Reach", 2)])
+    with pytest.raises(
+        ValueError, match=rf"{policy_type} was trained with '.*{key}' of size [35], .* with {size}"
+    ):
+        go_on(checkpoints[policy_type], dataset)
+
+
+def test_a_state_that_a_world_model_does_not_read_may_have_any_size(
+    checkpoints: dict[str, Path], tmp_path: Path
+) -> None:
+    dataset = record(tmp_path / "dataset", features(state=9), [("Reach", 4)])
+    assert isinstance(go_on(checkpoints["wm_rssm"], dataset), WMRSSMPolicy)
+
+
+def test_inserted_inputs_change_nothing() -> None:
+    torch.manual_seed(0)
+    mlp, x = MLP(5, [8, 8], 2), torch.randn(4, 5)
+    before = mlp(x)
+    mlp.insert_inputs(3, 2)
+    wider = torch.cat([x[:, :3], torch.randn(4, 2), x[:, 3:]], dim=1)
+    torch.testing.assert_close(mlp(wider), before)
+    mlp(wider).sum().backward()
+    assert mlp.trunk[0].weight.grad[:, 3:5].any()

@@ -1,0 +1,315 @@
+"""Dreams of episodes with two cameras of different sizes, by untrained world models made lively, and as a command."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from PIL import Image
+
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, REWARD, TASK
+from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
+from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
+from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
+from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from lerobot_wm.report.dream import OWN_ACTIONS, TRUE_ACTIONS, ZERO_ACTIONS, Dreams, dream
+from lerobot_wm.report.dream_figures import STEPS_SHOWN, strip_figure, video_frames
+from lerobot_wm.report.open_loop import load_world_model
+from lerobot_wm.world_model.config import RSSMConfig
+from tests.report.quality_model import lively_world_model
+
+Command = Callable[..., None]
+FRONT, WRIST = "observation.images.front", "observation.images.wrist"
+SIZES = {FRONT: (48, 80), WRIST: (64, 64)}
+LENGTHS = (9, 23, 3)
+CONTEXT = 4
+TASKS = ["lift it", "drop it"]
+
+
+def record(root: Path, cameras: dict[str, tuple[int, int]], action_dim: int = 3) -> Path:
+    """Episodes of random images, actions and rewards; the task of each is another."""
+    features = {
+        **{key: {"dtype": "image", "shape": (*size, 3), "names": None} for key, size in cameras.items()},
+        OBS_STATE: {"dtype": "float32", "shape": (2,), "names": None},
+        ACTION: {"dtype": "float32", "shape": (action_dim,), "names": None},
+        REWARD: {"dtype": "float32", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("test/dream", 30, features, root=root, use_videos=False)
+    rng = np.random.default_rng(0)
+    for episode, length in enumerate(LENGTHS):
+        for _ in range(length):
+            frame: dict[str, Any] = {
+                key: rng.integers(0, 256, (*size, 3), np.uint8) for key, size in cameras.items()
+            }
+            frame[OBS_STATE] = rng.normal(size=2).astype(np.float32)
+            frame[ACTION] = rng.uniform(-1, 1, action_dim).astype(np.float32)
+            frame[REWARD] = rng.uniform(size=1).astype(np.float32)
+            dataset.add_frame(frame | {TASK: TASKS[episode % 2]})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("dream") / "dataset", SIZES)
+
+
+def make_checkpoint(path: Path, policy_type: str, **settings: Any) -> Path:
+    """An untrained checkpoint whose images depend on what the world model saw and did."""
+    torch.manual_seed(0)
+    cameras = {key: PolicyFeature(FeatureType.VISUAL, (3, *size)) for key, size in SIZES.items()}
+    inputs = cameras | {OBS_STATE: PolicyFeature(FeatureType.STATE, (2,))}
+    common: dict[str, Any] = {
+        "output_features": {ACTION: PolicyFeature(FeatureType.ACTION, (3,))},
+        "image_key": f"{FRONT},{WRIST}",
+        "device": "cpu",
+        "push_to_hub": False,
+    }
+    rssm = RSSMConfig(
+        deter_dim=16, stoch_dim=8, hidden_dim=16, reward_hidden_dim=16, image_channels=6, action_dim=3
+    )
+    rssm = replace(rssm, predict_reward=settings.pop("predict_reward", True))
+    policy: WMRSSMPolicy | LatentPolicy
+    if policy_type == "wm_rssm":
+        policy = WMRSSMPolicy(WMRSSMConfig(rssm=rssm, input_features=inputs, **common))
+    else:
+        config_class = {"wm_bc": WMBCConfig, "wm_iql": WMIQLConfig}[policy_type]
+        policy_class = {"wm_bc": WMBCPolicy, "wm_iql": WMIQLPolicy}[policy_type]
+        settings = {"use_latent": True, "tasks": TASKS} | settings
+        if not settings["use_latent"]:
+            inputs = {OBS_STATE: inputs[OBS_STATE]}
+        if settings.get("use_environment_state"):
+            inputs |= {OBS_ENV_STATE: PolicyFeature(FeatureType.ENV, (5,))}
+        policy = policy_class(
+            config_class(
+                rssm=rssm if settings["use_latent"] else None, input_features=inputs, **common, **settings
+            )
+        )
+    low, high = torch.full((3,), -0.5), torch.full((3,), 1.5)
+    if policy_type != "wm_rssm":
+        policy.action_scaling.set_range(low, high)
+    policy.save_pretrained(path)
+    if policy_type == "wm_rssm" or settings["use_latent"]:
+        policy.world_model.load_state_dict(lively_world_model(path).state_dict())
+        policy.world_model.action_scaling.set_range(low, high)  # zero is not the middle of the range
+        policy.save_pretrained(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    types = ("wm_rssm", "wm_bc", "wm_iql")
+    return {name: make_checkpoint(tmp_path_factory.mktemp(name), name) for name in types}
+
+
+def episode_of(root: Path, index: int) -> dict[str, Any]:
+    """An episode's frames as the command reads them, here one frame at a time."""
+    dataset = LeRobotDataset("test/dream", root=root)
+    start = sum(LENGTHS[:index])
+    frames = [dataset[start + t] for t in range(LENGTHS[index])]
+    stacked = {key: torch.stack([frame[key] for frame in frames]) for key in (*SIZES, OBS_STATE, ACTION)}
+    return stacked | {REWARD: torch.stack([frame[REWARD] for frame in frames]), TASK: frames[0][TASK]}
+
+
+@pytest.fixture(scope="module")
+def dreams(root: Path, checkpoints: dict[str, Path]) -> Dreams:
+    return dream(load_world_model(str(checkpoints["wm_bc"])), episode_of(root, 1), CONTEXT)
+
+
+@pytest.mark.parametrize("policy_type", ["wm_bc", "wm_iql"])
+@torch.no_grad()
+def test_dreams_equal_one_step_at_a_time(policy_type: str, root: Path, checkpoints: dict[str, Path]) -> None:
+    policy = load_world_model(str(checkpoints[policy_type]))
+    episode = episode_of(root, 1)
+    dreams = dream(policy, episode, CONTEXT)
+    model, actions = policy.world_model, episode[ACTION]
+
+    # The policy's own filter sees the context, as in a rollout in which the episode's actions are executed.
+    policy.reset()
+    for t in range(CONTEXT):
+        frame = {key: episode[key][t : t + 1] for key in (*SIZES, OBS_STATE)} | {TASK: [episode[TASK]]}
+        own = policy.select_action(frame)
+        policy._prev_action = actions[t : t + 1]
+    seen, held = policy._filter_state, frame[OBS_STATE]
+
+    states = dict.fromkeys((TRUE_ACTIONS, ZERO_ACTIONS, OWN_ACTIONS), seen)
+    for t in range(CONTEXT, LENGTHS[1]):
+        executed = {
+            TRUE_ACTIONS: actions[t - 1 : t],
+            ZERO_ACTIONS: torch.zeros(1, 3),
+            OWN_ACTIONS: own,
+        }
+        for name, action in executed.items():
+            states[name] = model.imagine(states[name], action[:, None]).last()
+            latent = states[name].latent
+            told = dreams.dreams[name]
+            torch.testing.assert_close(told.images[t], model.decode(latent)[0], atol=1e-4, rtol=0)
+            torch.testing.assert_close(told.reward[t], model.predict_reward(latent)[0], atol=1e-4, rtol=0)
+        task = torch.eye(2)[[1]]
+        mean = policy.actor_mean(policy.observation(held, task, states[OWN_ACTIONS].latent))
+        own = policy.action_scaling.inverse(mean.clamp(-1, 1))
+
+    pictures = [told.images[-1] for told in dreams.dreams.values()]
+    assert min((a - b).abs().max() for a, b in pairwise(pictures)) > 1e-3
+    for told in dreams.dreams.values():
+        torch.testing.assert_close(told.images[CONTEXT - 1], model.decode(seen.latent)[0], atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("key", [OBS_STATE, OBS_ENV_STATE])
+def test_the_policy_is_not_told_where_the_demonstration_goes(key: str, root: Path, tmp_path: Path) -> None:
+    path = make_checkpoint(tmp_path, "wm_bc", use_environment_state=key == OBS_ENV_STATE)
+    policy, episode = load_world_model(str(path)), episode_of(root, 1)
+    episode[OBS_ENV_STATE] = torch.randn(LENGTHS[1], 5)
+
+    def own(changed_frame: int) -> torch.Tensor:
+        values = episode[key].clone()
+        values[changed_frame] += 10
+        return dream(policy, episode | {key: values}, CONTEXT).dreams[OWN_ACTIONS].images
+
+    same = dream(policy, episode, CONTEXT).dreams[OWN_ACTIONS].images
+    assert torch.equal(own(CONTEXT), same)
+    assert not torch.equal(own(CONTEXT - 1), same)
+
+
+def test_psnr_is_of_the_imagined_frames(dreams: Dreams) -> None:
+    truth = torch.zeros(4, 3, 2, 2)
+    truth[1] = 1  # the last frame seen
+    told = replace(dreams.dreams[TRUE_ACTIONS], images=torch.full_like(truth, 0.1))
+    made = replace(dreams, context=2, n_cameras=1, truth=truth, dreams={TRUE_ACTIONS: told})
+    assert made.psnr() == pytest.approx(20)
+    assert made.copy_psnr() == pytest.approx(0)
+
+
+def test_strip_shows_steps_and_reward(dreams: Dreams) -> None:
+    figure = strip_figure(dreams)
+    *pictures, rewards = figure.axes
+    columns = np.array(pictures, dtype=object).reshape(4, STEPS_SHOWN + 1)
+    assert [axes.get_title() for axes in columns[0]][:2] == ["last seen", "+2"]
+    assert columns[0, -1].get_title() == f"+{LENGTHS[1] - CONTEXT}"
+    for row, images in enumerate([dreams.truth, *(told.images for told in dreams.dreams.values())]):
+        # The second camera below the first.
+        picture = torch.cat([images[CONTEXT + 1, :3], images[CONTEXT + 1, 3:]], dim=1).movedim(0, -1)
+        shown = columns[row, 1].images[0].get_array()
+        np.testing.assert_array_equal(shown, (255 * picture).round().byte())
+    curves = {line.get_label(): line for line in rewards.lines}
+    # The true reward of frame t arrives with frame t + 1, which is where it is predicted.
+    np.testing.assert_array_equal(curves["truth (next.reward)"].get_xdata(), range(1, LENGTHS[1]))
+    np.testing.assert_array_equal(curves["truth (next.reward)"].get_ydata(), dreams.reward[:-1])
+    for name, told in dreams.dreams.items():
+        np.testing.assert_array_equal(curves[name].get_xdata(), range(1, LENGTHS[1]))
+        np.testing.assert_array_equal(curves[name].get_ydata(), told.reward[1:])
+
+
+def test_without_a_reward_head_there_is_no_curve(root: Path, tmp_path: Path) -> None:
+    path = make_checkpoint(tmp_path, "wm_rssm", predict_reward=False)
+    dreams = dream(load_world_model(str(path)), episode_of(root, 0), CONTEXT)
+    assert list(dreams.dreams) == [TRUE_ACTIONS, ZERO_ACTIONS]
+    assert len(strip_figure(dreams).axes) == 3 * (LENGTHS[0] - CONTEXT + 1)
+
+
+def test_video_frames_show_truth_and_dreams_side_by_side(dreams: Dreams) -> None:
+    frames = video_frames(dreams)
+    assert len(frames) == LENGTHS[1]
+    assert {frame.shape for frame in frames} == {(2 * 256 + 56, 4 * (256 + 8) + 8, 3)}
+    for i, images in enumerate([dreams.truth, *(told.images for told in dreams.dreams.values())]):
+        left = 8 + i * 264
+        wrist = frames[10][28 + 256 : 28 + 512 : 4, left : left + 256 : 4]
+        np.testing.assert_array_equal(wrist, (255 * images[10, 3:].movedim(0, -1)).round().byte())
+    # Had the model seen one frame more, only the words beneath that one and those imagined would be others.
+    later = video_frames(replace(dreams, context=CONTEXT + 1))
+    same = [np.array_equal(a, b) for a, b in zip(frames, later, strict=True)]
+    assert same == [t < CONTEXT for t in range(LENGTHS[1])]
+
+
+def flags(checkpoint: Path, root: Path, output_dir: Path) -> str:
+    dataset = f"--dataset.repo_id=test/dream --dataset.root={root}"
+    return f"dream --policy.path={checkpoint} {dataset} --output_dir={output_dir}"
+
+
+def test_command(
+    root: Path,
+    checkpoints: dict[str, Path],
+    dreams: Dreams,
+    tmp_path: Path,
+    lerobot_wm_command: Command,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    lerobot_wm_command(flags(checkpoints["wm_bc"], root, tmp_path), f"--episode=1 --context={CONTEXT}")
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert f"PSNR {dreams.psnr():.1f} dB under true actions, {dreams.copy_psnr():.1f} dB" in line
+    assert line.startswith(f"{LENGTHS[1] - CONTEXT} steps")
+    assert str(tmp_path / "episode_1.mp4") in line
+    assert str(tmp_path / "episode_1.png") in line
+    assert Image.open(tmp_path / "episode_1.png").width > 500
+    with av.open(str(tmp_path / "episode_1.mp4")) as video:
+        shown = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    expected = video_frames(dreams)
+    assert len(shown) == len(expected)
+    assert np.abs(shown[-1].astype(float) - expected[-1]).mean() < 10
+
+
+def test_a_horizon_ends_the_dream(
+    root: Path, checkpoints: dict[str, Path], tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    lerobot_wm_command(flags(checkpoints["wm_rssm"], root, tmp_path), "--episode=0 --context=2 --horizon=3")
+    with av.open(str(tmp_path / "episode_0.mp4")) as video:
+        assert len(list(video.decode(video=0))) == 5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("--episode=3", r"--episode=3, but test/dream has 3 episodes: give one of 0 to 2"),
+        ("--episode=-1", r"--episode=-1"),
+        ("--episode=2", r"Episode 2 has 3 frames; to see 5 and imagine the rest takes at least 6"),
+        ("--episode=0 --horizon=5", r"Episode 0 has 9 frames; to see 5 and imagine 5 takes at least 10"),
+        ("--episode=0 --horizon=0", r"--horizon=0.*at least 1 step"),
+        ("--episode=0 --context=0", r"--context=0.*at least 1 frame"),
+    ],
+)
+def test_episodes_that_cannot_be_dreamt(
+    wrong: str,
+    message: str,
+    root: Path,
+    checkpoints: dict[str, Path],
+    tmp_path: Path,
+    lerobot_wm_command: Command,
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        lerobot_wm_command(flags(checkpoints["wm_rssm"], root, tmp_path), wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_checkpoints_that_cannot_dream(root: Path, tmp_path: Path, lerobot_wm_command: Command) -> None:
+    blind = make_checkpoint(tmp_path / "blind", "wm_bc", use_latent=False)
+    with pytest.raises(ValueError, match=r"\(wm_bc\) holds no world model"):
+        lerobot_wm_command(flags(blind, root, tmp_path), "--episode=0")
+    stranger = make_checkpoint(tmp_path / "stranger", "wm_bc", tasks=["fold it", "iron it"])
+    with pytest.raises(ValueError, match=r"Unknown task \['lift it'\]"):
+        lerobot_wm_command(flags(stranger, root, tmp_path), "--episode=0")
+
+
+def test_datasets_that_cannot_be_dreamt_of(
+    checkpoints: dict[str, Path], tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    one_camera = record(tmp_path / "one", {FRONT: (48, 80)})
+    with pytest.raises(
+        ValueError, match=r"has no observation\.images\.wrist; it has .*observation\.images\.front"
+    ):
+        lerobot_wm_command(flags(checkpoints["wm_rssm"], one_camera, tmp_path), "--episode=0")
+    other_robot = record(tmp_path / "robot", SIZES, action_dim=5)
+    with pytest.raises(
+        ValueError, match=r"'action' of test/dream is \(5,\), the checkpoint was trained on \(3,\)"
+    ):
+        lerobot_wm_command(flags(checkpoints["wm_rssm"], other_robot, tmp_path), "--episode=0")
