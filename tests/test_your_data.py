@@ -1,6 +1,5 @@
 """The commands and the program of docs/your_data.md, in their order, at a size for tests."""
 
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,10 +9,11 @@ import pytest
 import torch
 from lerobot.scripts import lerobot_train
 
+from tests.documents import blocks, commands
 from tests.flags import SMALL_WORLD_MODEL
 from tests.recording import FRONT, WRIST, camera, record, vector
 
-DOCUMENT = (Path(__file__).parents[1] / "docs" / "your_data.md").read_text()
+DOCUMENT = "docs/your_data.md"
 FEATURES = {
     FRONT: camera(96, 128),
     WRIST: camera(48, 48),
@@ -21,16 +21,6 @@ FEATURES = {
     "action": vector(7),
     "next.success": vector(1, "bool"),
 }
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
-
-
-def commands() -> list[list[str]]:
-    """Each command's words, as a shell would hand them on."""
-    text = "".join(blocks("bash")).replace("\\\n", " ").replace("$USER", "test").replace("'", "")
-    return [line.split() for line in text.splitlines()]
 
 
 def small(words: list[str]) -> list[str]:
@@ -53,7 +43,7 @@ def test_the_page_works_as_written(
     dataset = record(tmp_path / "data" / "robot", FEATURES, [("Pick", 8), ("Place", 5)], labels)
     record(tmp_path / "data" / "new_tasks", FEATURES, [("Stack", 7)], labels)
     monkeypatch.chdir(tmp_path)
-    for words in commands():
+    for words in commands(DOCUMENT):
         if words[0] == "lerobot-train":
             monkeypatch.setattr(sys, "argv", small(words))
             lerobot_train.main()
@@ -66,7 +56,7 @@ def test_the_page_works_as_written(
     keys = (FRONT, WRIST, "observation.state")
     item = dataset[0]
     frame = {**{key: item[key][None] for key in keys}, "task": [item["task"]]}
-    [program] = blocks("python")
+    [program] = blocks(DOCUMENT, "python")
     names: dict[str, torch.Tensor] = {"frame": frame}
     exec(program, names)
     assert names["action"].shape == (1, 7)
