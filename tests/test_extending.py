@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.documents import blocks, commands, with_flags
 
 
+@pytest.mark.slow
 def test_the_policy_of_the_page_trains_and_acts(
     tmp_path: Path, demos_root: Path, world_model_path: Path
 ) -> None:

@@ -34,6 +34,7 @@ def small(words: list[str]) -> list[str]:
     return [*kept, *sizes.split()]
 
 
+@pytest.mark.slow
 def test_the_page_works_as_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lerobot_wm_command: Callable[..., None]
 ) -> None:
