@@ -67,3 +67,14 @@ def test_links_within_the_repository_lead_somewhere(document: str) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
         if not target.startswith(("http://", "https://")):
             assert (ROOT / document).parent.joinpath(target).exists(), target
+
+
+def test_messages_in_troubleshooting_are_those_of_the_code() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    quoted = re.findall(r"^\| `([^`]+)` \|", page, re.MULTILINE)
+    assert len(quoted) > 8
+    code = "\n".join(path.read_text() for path in (ROOT / "lerobot_wm").rglob("*.py"))
+    code = re.sub(r'"\s*\n\s*f?"', "", code)  # messages that go on in the next line
+    for message in quoted:
+        pattern = ".*".join(re.escape(part) for part in message.split("..."))
+        assert re.search(pattern, code), message
