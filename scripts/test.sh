@@ -8,7 +8,7 @@ bash scripts/setup.sh
 
 lint=0
 if [[ $# -eq 0 ]]; then
-  .venv/bin/ruff check . && .venv/bin/ruff format --check . || lint=$?
+  .venv/bin/ruff check . && .venv/bin/ruff format --check . && .venv/bin/mypy || lint=$?
 fi
 HF_HUB_OFFLINE=1 MUJOCO_GL="${MUJOCO_GL:-egl}" .venv/bin/python -m pytest "$@"
 exit "$lint"
