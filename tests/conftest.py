@@ -12,6 +12,7 @@ from accelerate.state import AcceleratorState
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.scripts import lerobot_train
 
 import lerobot_wm  # noqa: F401  (registers the policy and environment types)
 from lerobot_wm import cli
@@ -40,6 +41,17 @@ def run_command(*arguments: str) -> None:
 def lerobot_wm_command() -> Callable[..., None]:
     """`lerobot-wm` as a function."""
     return run_command
+
+
+@pytest.fixture
+def lerobot_train_command(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """`lerobot-train` as a function of its flags."""
+
+    def run(flags: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags.split()])
+        lerobot_train.main()
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from tests.flags import TRAIN_FLAGS
+
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 FRAME_SHAPES = {FRONT: (96, 128, 3), WRIST: (48, 48, 3)}
 
@@ -56,6 +58,11 @@ def record(
         dataset.save_episode()
     dataset.finalize()
     return LeRobotDataset("test/recorded", root=root)
+
+
+def train_flags(dataset: LeRobotDataset) -> str:
+    """Flags that train on a dataset recorded here."""
+    return f"{TRAIN_FLAGS} --dataset.repo_id=test/recorded --dataset.root={dataset.root}"
 
 
 def record_stranger(

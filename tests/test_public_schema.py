@@ -4,7 +4,6 @@ PNG images of 480x480, a dense next.reward, next.success, and no next.done: the 
 """
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,14 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_policy_config
-from lerobot.scripts import lerobot_train
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from safetensors.torch import load_file
 
 from lerobot_wm.policies.iql_agent import Outcomes
 from lerobot_wm.policies.rewards import FrameLabel
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
-from tests.recording import camera, record, vector
+from tests.flags import SMALL_WORLD_MODEL
+from tests.recording import camera, record, train_flags, vector
 
 Command = Callable[..., None]
 CHECKPOINT = Path("checkpoints", "last", "pretrained_model")
@@ -56,7 +54,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> LeRobotDataset:
 
 @pytest.fixture(scope="module")
 def flags(dataset: LeRobotDataset) -> str:
-    return f"{TRAIN_FLAGS} --dataset.repo_id=test/recorded --dataset.root={dataset.root}"
+    return train_flags(dataset)
 
 
 @pytest.fixture(scope="module")
@@ -132,16 +130,13 @@ def test_world_model_and_policy(
 
 
 def test_both_commands_learn_alike_from_success(
-    flags: str, tmp_path: Path, lerobot_wm_command: Command, monkeypatch: pytest.MonkeyPatch
+    flags: str, tmp_path: Path, lerobot_wm_command: Command, lerobot_train_command: Command
 ) -> None:
     run = (
         f"--policy.type=e2e_iql --policy.encoder_image_size=[32,32] --policy.dtype=float32 --policy.dropout=0 "
         f"--steps=2 --batch_size=18 --log_freq=1 {flags}"
     )
-    monkeypatch.setattr(
-        sys, "argv", f"lerobot-train {run} {SUCCESS_REWARD} --output_dir={tmp_path}/theirs".split()
-    )
-    lerobot_train.main()
+    lerobot_train_command(f"{run} {SUCCESS_REWARD} --output_dir={tmp_path}/theirs")
     lerobot_wm_command(f"train {run} {SUCCESS_REWARD} --output_dir={tmp_path}/ours")
     lerobot_wm_command(f"train {run} --output_dir={tmp_path}/dense")
     theirs, ours, dense = (

@@ -3,14 +3,12 @@
 Two cameras of different sizes, 9-d state, 7-d action, no reward, three tasks, episodes of 10 to 300 frames.
 """
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 from torch.utils.data import DataLoader
 
@@ -20,7 +18,7 @@ from lerobot_wm.policies.e2e_bc.modeling_e2e_bc import E2EBCPolicy
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
-from tests.recording import FRAME_SHAPES, FRONT, WRIST, record_stranger
+from tests.recording import FRAME_SHAPES, FRONT, WRIST, record_stranger, train_flags
 
 Command = Callable[..., None]
 CHECKPOINT = Path("checkpoints", "last", "pretrained_model")
@@ -37,7 +35,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> LeRobotDataset:
 
 @pytest.fixture(scope="module")
 def flags(dataset: LeRobotDataset) -> str:
-    return f"{TRAIN_FLAGS} --dataset.repo_id=test/recorded --dataset.root={dataset.root}"
+    return train_flags(dataset)
 
 
 @pytest.fixture(scope="module")
@@ -134,12 +132,8 @@ def test_plain_lerobot_commands(
     dataset: LeRobotDataset,
     tmp_path: Path,
     lerobot_wm_command: Command,
-    monkeypatch: pytest.MonkeyPatch,
+    lerobot_train_command: Command,
 ) -> None:
-    def lerobot_train_command(arguments: str) -> None:
-        monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments.split()])
-        lerobot_train.main()
-
     world_model, latents = tmp_path / "world_model" / CHECKPOINT, tmp_path / "latents"
     lerobot_train_command(
         f"--policy.type=wm_rssm {WORLD_MODEL} {flags} --output_dir={tmp_path / 'world_model'}"
@@ -161,15 +155,14 @@ def test_end_to_end_policies_of_both_commands_are_equal(
     dataset: LeRobotDataset,
     tmp_path: Path,
     lerobot_wm_command: Command,
-    monkeypatch: pytest.MonkeyPatch,
+    lerobot_train_command: Command,
 ) -> None:
     # Without dropout: LeRobot's loader draws from the generator that dropout masks come from, ours does not.
     run = (
         "--policy.type=e2e_bc --policy.encoder_image_size=[32,40] --policy.dtype=float32 --policy.dropout=0 "
         f"--steps=2 --batch_size=4 {flags} --output_dir={tmp_path}"
     )
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", *f"{run}/theirs".split()])
-    lerobot_train.main()
+    lerobot_train_command(f"{run}/theirs")
     lerobot_wm_command(f"train {run}/ours")
     theirs, ours = (
         load_file(tmp_path / name / CHECKPOINT / "model.safetensors") for name in ("theirs", "ours")
@@ -192,7 +185,7 @@ def test_one_camera_chosen_by_flag(flags: str, tmp_path: Path, lerobot_wm_comman
 
 def test_one_task_needs_no_task_string(tmp_path: Path, lerobot_wm_command: Command) -> None:
     dataset = record_stranger(tmp_path / "dataset", lengths=(12,))
-    flags = f"{TRAIN_FLAGS} --dataset.repo_id=test/recorded --dataset.root={dataset.root}"
+    flags = train_flags(dataset)
     lerobot_wm_command(
         f"train --policy.type=wm_rssm {WORLD_MODEL} {flags} --output_dir={tmp_path / 'world_model'}"
     )

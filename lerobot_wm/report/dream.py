@@ -58,11 +58,7 @@ class Dreams:
 def shapes_read(policy: WMRSSMPolicy | LatentPolicy) -> dict[str, tuple[int, ...]]:
     """Keys that dreams read from a dataset, with their shapes in training (cameras: C, H, W)."""
     config = policy.config
-    if isinstance(policy, LatentPolicy):
-        keys = list(config.input_features)
-    else:
-        keys = config.cameras + ([OBS_STATE] if policy.config.rssm.use_proprio else [])
-    shapes = {key: tuple(config.input_features[key].shape) for key in keys}
+    shapes = {key: tuple(config.input_features[key].shape) for key in config.features_read}
     return shapes | {ACTION: tuple(config.output_features[ACTION].shape)}
 
 

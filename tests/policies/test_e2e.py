@@ -1,4 +1,3 @@
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,6 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
-from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
@@ -260,7 +258,7 @@ def test_both_training_commands(
     demos: LeRobotDataset,
     tmp_path: Path,
     lerobot_wm_command: Callable[..., None],
-    monkeypatch: pytest.MonkeyPatch,
+    lerobot_train_command: Callable[[str], None],
 ) -> None:
     """LeRobot's loader and ours give the same checkpoint, which acts on the dataset's frames."""
     # Without dropout: LeRobot's loader draws from the generator that dropout masks come from, ours does not.
@@ -269,8 +267,7 @@ def test_both_training_commands(
         f"--steps=3 --batch_size=8 --log_freq=1 {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)} "
         f"--output_dir={tmp_path}"
     )
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", *f"{flags}/theirs".split()])
-    lerobot_train.main()
+    lerobot_train_command(f"{flags}/theirs")
     lerobot_wm_command(f"train {flags}/ours")
     checkpoints = [tmp_path / run / "checkpoints" / "last" / "pretrained_model" for run in ("theirs", "ours")]
     theirs, ours = (load_file(checkpoint / "model.safetensors") for checkpoint in checkpoints)

@@ -1,7 +1,6 @@
 """Training that goes on from a checkpoint, with another dataset: other tasks, other camera sizes, no reward."""
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.factory import get_policy_class, make_policy_config
-from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 from torch import nn
 
@@ -22,7 +20,7 @@ from lerobot_wm.pipeline.encode import encode_to_cache
 from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
-from tests.recording import FRONT, WRIST, camera, record, vector
+from tests.recording import FRONT, WRIST, camera, record, train_flags, vector
 
 Command = Callable[..., None]
 CHECKPOINT = Path("checkpoints", "last", "pretrained_model")
@@ -57,10 +55,6 @@ def known(folder: Path) -> LeRobotDataset:
 def other(folder: Path) -> LeRobotDataset:
     """One task of before and a new one, the first camera of another size, other ranges of numbers."""
     return record(folder / "other", {**features((60, 40)), **REWARDS}, [("Wave", 5), ("Push", 9)])
-
-
-def on(dataset: LeRobotDataset) -> str:
-    return f"{TRAIN_FLAGS} --dataset.repo_id=test/recorded --dataset.root={dataset.root}"
 
 
 @pytest.fixture(scope="module")
@@ -157,8 +151,8 @@ def test_a_fine_tuned_run_is_resumed_exactly(
 ) -> None:
     run = tmp_path / "e2e_bc"
     lerobot_wm_command(
-        f"train --policy.path={checkpoints['e2e_bc']} --steps=2 --save_freq=1 --batch_size=4 --log_freq=1 {on(other)}",
-        f"--output_dir={run}",
+        f"train --policy.path={checkpoints['e2e_bc']} --steps=2 --save_freq=1 --batch_size=4 --log_freq=1",
+        f"{train_flags(other)} --output_dir={run}",
     )
     whole = load_file(run / CHECKPOINT / "model.safetensors")
     shutil.rmtree(run / "checkpoints" / "000002")
@@ -176,9 +170,9 @@ def test_plain_lerobot_train(
     other: LeRobotDataset,
     tmp_path: Path,
     lerobot_wm_command: Command,
-    monkeypatch: pytest.MonkeyPatch,
+    lerobot_train_command: Command,
 ) -> None:
-    data = on(other)
+    data = train_flags(other)
     if policy_type == "wm_bc":  # its checkpoint has the world model that makes its latents
         lerobot_wm_command(
             f"encode --world_model_path={checkpoints['wm_bc']} --device=cpu --dataset.repo_id=test/recorded",
@@ -187,8 +181,7 @@ def test_plain_lerobot_train(
         data = f"{TRAIN_FLAGS} --dataset.repo_id=test/latents --dataset.root={tmp_path / 'latents'}"
     run = tmp_path / policy_type
     flags = f"--policy.path={checkpoints[policy_type]} {SHORT} {data} --output_dir={run}"
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags.split()])
-    lerobot_train.main()
+    lerobot_train_command(flags)
     policy = load(run / CHECKPOINT)
     assert policy.config.input_features[FRONT].shape == (3, 60, 40)
     if policy_type != "wm_rssm":
@@ -203,7 +196,9 @@ def test_our_command_encodes_with_the_checkpoints_own_world_model(
     shutil.copytree(checkpoints["wm_iql"], copy)
     config = copy / "config.json"
     config.write_text(config.read_text().replace(str(checkpoints["wm_rssm"]), "gone"))
-    lerobot_wm_command(f"train --policy.path={copy} {SHORT} {on(other)} --output_dir={tmp_path / 'run'}")
+    lerobot_wm_command(
+        f"train --policy.path={copy} {SHORT} {train_flags(other)} --output_dir={tmp_path / 'run'}"
+    )
     policy = load(tmp_path / "run" / CHECKPOINT)
     assert policy.config.tasks == ["Reach", "Push", "Wave"]
     assert act(policy, other, "Wave").shape == (2, 3)
@@ -224,7 +219,7 @@ def test_a_world_model_goes_on_without_rewards(
     """Its reward head stays as it was, and the rest is trained."""
     dataset = record(tmp_path / "dataset", features(), [("Wave", 6)])
     lerobot_wm_command(
-        f"train --policy.path={checkpoints['wm_rssm']} {SHORT} {on(dataset)} --output_dir={tmp_path / 'run'}"
+        f"train --policy.path={checkpoints['wm_rssm']} {SHORT} {train_flags(dataset)} --output_dir={tmp_path / 'run'}"
     )
     before, after = (
         load_file(path / "model.safetensors")

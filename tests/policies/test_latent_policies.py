@@ -174,14 +174,13 @@ def test_training_on_images_encodes_them_first(
 
 
 def test_plain_lerobot_train_on_latents(
-    latents_root: Path, world_model_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    latents_root: Path, world_model_path: Path, tmp_path: Path, lerobot_train_command: Callable[[str], None]
 ) -> None:
     flags = (
         f"--policy.type=wm_iql --policy.world_model_path={world_model_path} --steps=2 --batch_size=8 {TRAIN_FLAGS} "
         f"--dataset.repo_id=test/latents --dataset.root={latents_root} --output_dir={tmp_path / 'run'}"
     )
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags.split()])
-    lerobot_train.main()
+    lerobot_train_command(flags)
     WMIQLPolicy.from_pretrained(tmp_path / "run" / "checkpoints" / "last" / "pretrained_model")
 
 

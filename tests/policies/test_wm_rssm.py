@@ -1,6 +1,5 @@
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 
 from lerobot_wm.data.loader import RamDataset
@@ -50,11 +48,10 @@ def test_resume_is_exact(
 
 
 def test_plain_lerobot_train_takes_the_same_flags(
-    demos_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    demos_root: Path, tmp_path: Path, lerobot_train_command: Callable[[str], None]
 ) -> None:
     flags = f"{SHORT} {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)} --output_dir={tmp_path / 'run'}"
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags.split()])
-    lerobot_train.main()
+    lerobot_train_command(flags)
     policy = WMRSSMPolicy.from_pretrained(tmp_path / "run" / "checkpoints" / "last" / "pretrained_model")
     assert policy.config.window_length == 4
 
