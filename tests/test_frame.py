@@ -106,6 +106,7 @@ def test_lock_satisfies_pyproject() -> None:
     declared = [
         *project["build-system"]["requires"],
         *project["project"]["dependencies"],
+        *project["project"]["optional-dependencies"]["environments"],
         *project["project"]["optional-dependencies"]["dev"],
     ]
     versions = locked()
@@ -119,14 +120,28 @@ def test_lock_leaves_torchcodec_out() -> None:
     assert "torchcodec" not in locked()
 
 
+# Requirements that the lock does not meet, and why it works nevertheless.
+UNMET = {
+    ("gym-pusht", "opencv-python"): "the headless one, which is locked, is the same package without windows",
+    (
+        "gym-aloha",
+        "mujoco",
+    ): "asks for <3.9 as an older dm-control does; runs with the locked ones (its test shows it)",
+    ("dm-control", "labmaze"): "of its mazes, not imported here; has no wheel for Python 3.13",
+}
+
+
 def test_locked_packages_agree_with_each_other() -> None:
-    """Every requirement of every locked package is in the lock, at a version it accepts."""
+    """Every requirement of every locked package is in the lock, at a version it accepts; but for the known."""
     versions = locked()
+    unmet = set()
     for name in versions:
         for requirement in map(Requirement, importlib.metadata.requires(name) or []):
             if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
                 key = requirement.name.lower().replace("_", "-").replace(".", "-")
-                assert requirement.specifier.contains(versions[key], prereleases=True), (name, requirement)
+                if key not in versions or not requirement.specifier.contains(versions[key], prereleases=True):
+                    unmet.add((name, key))
+    assert unmet == set(UNMET)
 
 
 def test_wheel_holds_modules_data_and_license(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from torch import Tensor
 
-from lerobot_wm.constants import OBS_IMAGE
+from lerobot_wm.constants import OBS_IMAGE, OBS_STATE
 from lerobot_wm.data.resize import resize_images
 from lerobot_wm.policies.features import image_keys
 
@@ -93,10 +93,10 @@ def camera_images(config: ImagePolicyConfig, batch: Mapping[str, Tensor]) -> Ten
 
 
 def check_images(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:
-    """Check what a policy is shown at test time, each camera (B, C, H, W).
+    """Check what a policy is shown at test time: each camera (B, C, H, W), and `observation.state` (B, P).
 
     Raises:
-        ValueError: A camera is missing or has another size than in training.
+        ValueError: A camera is missing or has another size than in training, or the state has another size.
     """
     _check_there(config, batch)
     for key in config.cameras:
@@ -105,8 +105,15 @@ def check_images(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:
         if found != expected:
             raise ValueError(
                 f"'{key}' is {found}, this policy was trained on {expected} (C, H, W): set the camera or environment "
-                f"to {expected[1]}x{expected[2]} (--env.image_size={expected[1]} for metaworld_mt)."
+                f"to a height of {expected[1]} and a width of {expected[2]} (in --robot.cameras of a robot, by "
+                f"--env.image_size={expected[1]} for metaworld_mt)."
             )
+    trained_on = config.input_features.get(OBS_STATE)
+    if trained_on is not None and batch[OBS_STATE].shape[1:] != tuple(trained_on.shape):
+        raise ValueError(
+            f"'{OBS_STATE}' has {batch[OBS_STATE].shape[-1]} numbers, this policy was trained on "
+            f"{trained_on.shape[0]}: the robot or environment is not of the kind that its dataset was recorded on."
+        )
 
 
 def _check_there(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:

@@ -110,12 +110,14 @@ class MultiTaskPolicy(StrictPolicy):
             ValueError: A task string is missing or is not one the policy was trained on.
         """
         known = self.config.tasks
-        names = [known[0]] * batch_size if len(known) == 1 else batch.get(TASK)
-        if names is None:
-            raise ValueError(
-                f"The batch has no '{TASK}' strings; this policy knows {len(known)} tasks: {known}."
-            )
+        given = batch.get(TASK) or [""] * batch_size  # lerobot-rollout gives "" where it was given none
+        names = [known[0]] * batch_size if len(known) == 1 else given
         unknown = set(names) - set(known)
+        if "" in unknown:
+            raise ValueError(
+                f"The batch has no '{TASK}' strings; this policy knows {len(known)} tasks: {known}. Name one of them, "
+                "letter by letter (by --task for lerobot-rollout)."
+            )
         if unknown:
             raise ValueError(
                 f"Unknown task {sorted(unknown)}; this policy was trained on {known}. Use one of these strings, or "
