@@ -3,7 +3,16 @@
 import importlib
 import sys
 
-from lerobot_wm.hub.errors import exit_on_hub_error
+from lerobot.configs.parser import (
+    PLUGIN_DISCOVERY_SUFFIX,
+    PluginLoadError,
+    filter_arg,
+    load_plugin,
+    parse_plugin_args,
+)
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_wm.pipeline.errors import exit_with_one_line
 
 # name -> (module with a main() that reads sys.argv, what it does)
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -29,6 +38,25 @@ def usage() -> str:
     return "\n".join(lines)
 
 
+def load_plugins(arguments: list[str]) -> list[str]:
+    """Have every command know the types of other packages: installed ones, and those named by a flag.
+
+    Args:
+        arguments: Of the command; `--discover_packages_path=PACKAGE`, under any prefix, names a package to import.
+
+    Returns:
+        The other arguments.
+
+    Raises:
+        PluginLoadError: There is no such package, or it cannot be imported.
+    """
+    register_third_party_plugins()
+    for flag, package in parse_plugin_args(PLUGIN_DISCOVERY_SUFFIX, arguments).items():
+        load_plugin(package)
+        arguments = filter_arg(flag, arguments)
+    return arguments
+
+
 def main() -> None:
     """Run the subcommand named first on the command line."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
@@ -37,9 +65,13 @@ def main() -> None:
         return
     if name not in COMMANDS:
         sys.exit(f"lerobot-wm: no command '{name}'; expected one of {', '.join(COMMANDS)}.")
+    try:
+        arguments = load_plugins(sys.argv[2:])
+    except PluginLoadError as error:
+        sys.exit(f"lerobot-wm {name}: {error}")
     # LeRobot's parsers read sys.argv themselves: hand the subcommand its own argument list.
-    sys.argv = [f"lerobot-wm {name}", *sys.argv[2:]]
-    with exit_on_hub_error(sys.argv[0]):
+    sys.argv = [f"lerobot-wm {name}", *arguments]
+    with exit_with_one_line(sys.argv[0]):
         importlib.import_module(COMMANDS[name][0]).main()
 
 

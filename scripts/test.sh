@@ -10,5 +10,7 @@ lint=0
 if [[ $# -eq 0 ]]; then
   .venv/bin/ruff check . && .venv/bin/ruff format --check . && .venv/bin/mypy || lint=$?
 fi
-HF_HUB_OFFLINE=1 MUJOCO_GL="${MUJOCO_GL:-egl}" .venv/bin/python -m pytest "$@"
+# Files side by side, one thread each: two threads per process on two cores wait for each other.
+HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 MUJOCO_GL="${MUJOCO_GL:-egl}" \
+  .venv/bin/python -m pytest -n auto --maxprocesses=4 --dist=loadfile "$@"
 exit "$lint"

@@ -30,6 +30,8 @@ def run_command(*arguments: str) -> None:
     sys.argv = ["lerobot-wm", *" ".join(arguments).split()]
     try:
         cli.main()
+    except SystemExit as end:
+        raise end.__cause__ or end from None  # the error that the command's one line was made of
     finally:
         sys.argv = before
         AcceleratorState._reset_state(

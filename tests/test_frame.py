@@ -155,6 +155,8 @@ def test_wheel_holds_modules_data_and_license(tmp_path: Path) -> None:
         "lerobot_wm/hub/latents.md.j2",
         "lerobot_wm/hub/model_card.md.j2",
         "lerobot_wm/report/page.html.j2",
+        "lerobot_wm/report/page.css",
+        "lerobot_wm/report/data_section.html.j2",
         "lerobot_wm/report/quality_section.html.j2",
         "lerobot_policy_wm.py",
     }

@@ -18,6 +18,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_wm.cores import usable_cores
+from lerobot_wm.data.check_info import MEND, one_line
+from lerobot_wm.data.errors import DatasetError
 from lerobot_wm.data.fingerprint import dataset_fingerprint
 from lerobot_wm.data.resize import resize_images
 
@@ -86,6 +88,7 @@ class CameraCache:
 
         Raises:
             OSError: Their frames do not fit on the disk.
+            DatasetError: A file is damaged.
         """
         missing = [episode for episode in episodes if not self._decoded[episode]]
         if not missing:
@@ -110,13 +113,25 @@ class CameraCache:
         row = self._dataset.meta.episodes[episode]
         size = self._frames.shape[1:3]
         position = row["dataset_from_index"]
-        for images in self._images(row):
-            if images.shape[-2:] != size:
-                images = (resize_images(images.float() / 255, size) * 255).round().to(torch.uint8)
-            self._frames[position : position + len(images)] = images.permute(0, 2, 3, 1).numpy()
-            position += len(images)
+        try:
+            for images in self._images(row):
+                if images.shape[-2:] != size:
+                    images = (resize_images(images.float() / 255, size) * 255).round().to(torch.uint8)
+                self._frames[position : position + len(images)] = images.permute(0, 2, 3, 1).numpy()
+                position += len(images)
+        except Exception as error:  # what decoders raise for damaged bytes is not documented
+            raise DatasetError(
+                f"{self._file(episode)}: the images of {self._key} in episode {episode} cannot be decoded "
+                f"({one_line(error)}): the file is damaged; {MEND}."
+            ) from error
         self._frames.flush()
         self._decoded[episode] = 1
+
+    def _file(self, episode: int) -> Path:
+        meta, root = self._dataset.meta, Path(self._dataset.root)
+        if self._key in meta.video_keys:
+            return root / meta.get_video_file_path(episode, self._key)
+        return root / meta.get_data_file_path(episode)
 
     def _images(self, row: dict[str, Any]) -> Iterator[Tensor]:
         """An episode's frames as they are stored, some at a time: (T, C, H, W) uint8."""
@@ -126,7 +141,7 @@ class CameraCache:
             # LeRobot's own decoder, asked for a whole episode at once: equal frames, one seek.
             first = row[f"videos/{self._key}/from_timestamp"]
             images = decode_video_frames(
-                self._dataset.root / meta.get_video_file_path(row["episode_index"], self._key),
+                self._file(row["episode_index"]),
                 [first + i / meta.fps for i in range(stop - start)],
                 tolerance_s=1 / (4 * meta.fps),
                 return_uint8=True,

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_wm.data.cache import camera_frames
+from lerobot_wm.data.finite import check_finite_columns
 from lerobot_wm.data.tables import column_tensor
 
 _GPU_SHARE = 0.6  # of the free GPU memory may be taken by resident frames; activations need the rest
@@ -39,6 +40,7 @@ class RamDataset:
 
     Raises:
         ValueError: The dataset applies image transforms, which decoded frames do not go through.
+        DatasetError: An observation, action or reward is not finite.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class RamDataset:
             for key, shape in features.items()
             if key not in meta.camera_keys
         }
+        check_finite_columns(self._columns, self._tasks, dataset.repo_id)
         # PNG frames leave LeRobot's loader as float32, video frames as uint8 for the training loop to convert.
         self._float_cameras = set(meta.image_keys)
         self._cameras = {
@@ -139,10 +142,18 @@ class RamLoader:
             dataset, self._subset = dataset.dataset, dataset.indices
         self._batch_sampler = batch_sampler
         self._source = RamDataset(dataset, device, cameras)
+        self._episodes = torch.empty(0)
+
+    @property
+    def episodes(self) -> list[int]:
+        """The episodes in the batch served last."""
+        return sorted(set(self._episodes.tolist()))
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for rows in self._batch_sampler:
-            yield self._source.batch(rows if self._subset is None else [self._subset[i] for i in rows])
+            batch = self._source.batch(rows if self._subset is None else [self._subset[i] for i in rows])
+            self._episodes = batch["episode_index"]  # (B,)
+            yield batch
 
     def __len__(self) -> int:
         return len(self._batch_sampler)  # type: ignore[arg-type]

@@ -1,9 +1,7 @@
 """What goes wrong with the Hub, in one line."""
 
 import re
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -82,22 +80,6 @@ def check_dataset_version(repo_id: str, root: str | Path | None, revision: str |
             f"dataset {repo_id} has no revision {revision!r}; it has the versions "
             f"{', '.join(f'v{version}' for version in versions)}: give one of them as --dataset.revision."
         )
-
-
-@contextmanager
-def exit_on_hub_error(command: str) -> Iterator[None]:
-    """End the program with one line where the Hub refuses or breaks off; other errors pass.
-
-    Args:
-        command: Its name, for the line.
-    """
-    try:
-        yield
-    except Exception as error:
-        line = explain(error)
-        if line is None:
-            raise
-        sys.exit(f"{command}: {line}")
 
 
 def explain(error: BaseException) -> str | None:

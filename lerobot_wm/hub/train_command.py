@@ -19,7 +19,6 @@ _NOT_CHOSEN = {
     "rssm.action_dim",
     "rssm.proprio_dim",
     "rssm.predict_reward",
-    "frozen_backbone",
     "world_model_fingerprint",
     "trained_betas",
     "normalization_mapping",

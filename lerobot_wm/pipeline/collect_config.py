@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub.utils import validate_repo_id
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_wm.constants import CAMERA_NAME, IMAGE_SIZE, MAX_EPISODE_STEPS, REPORTED_VARIATION_SET
@@ -56,6 +57,8 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         """Check every field."""
+        if self.root is None:  # else the name is no folder
+            validate_repo_id(self.repo_id)
         resolve_tasks(self.tasks)
         parse_variations(self.variations)
         check_variation_set(self.variation_set)

@@ -21,7 +21,6 @@ from lerobot_wm.constants import (
     TASK_ID,
     VARIATION,
 )
-from lerobot_wm.data.schema import check_finite
 from lerobot_wm.envs.rendering import Renderer
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import expert_name, task_description, task_id
@@ -73,7 +72,7 @@ def demonstrate(
             break
     if not any(successes):
         return None
-    demonstration = Demonstration(
+    return Demonstration(
         task=simulation.task,
         variation=variation,
         physics=np.array(physics),
@@ -82,15 +81,6 @@ def demonstrate(
         dense_rewards=np.array(dense_rewards),
         successes=np.array(successes),
     )
-    check_finite(
-        {
-            OBS_ENV_STATE: demonstration.states,
-            ACTION: demonstration.actions,
-            DENSE_REWARD: demonstration.dense_rewards,
-        },
-        where=f"{simulation.task}, variation {variation}",
-    )
-    return demonstration
 
 
 def dataset_frames(

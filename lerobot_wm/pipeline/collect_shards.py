@@ -17,8 +17,17 @@ import numpy as np
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.constants import FPS, MAX_EPISODE_STEPS, ROBOT_TYPE
-from lerobot_wm.data.schema import metaworld_features
+from lerobot_wm.constants import (
+    ACTION,
+    DENSE_REWARD,
+    FPS,
+    MAX_EPISODE_STEPS,
+    OBS_ENV_STATE,
+    OBS_STATE,
+    REWARD,
+    ROBOT_TYPE,
+)
+from lerobot_wm.data.schema import check_finite, metaworld_features
 from lerobot_wm.envs.cameras import image_features
 from lerobot_wm.envs.rendering import Renderer, RenderKey
 from lerobot_wm.envs.simulation import Simulation
@@ -28,6 +37,7 @@ from lerobot_wm.pipeline.collect_record import SHARD_RECORD, EpisodeRecord, Shar
 
 SHARD_EPISODES = 13  # some ten seconds of work: what a killed worker has to redo
 TEMPORARY_PREFIX = "unfinished-"
+_FINITE = (OBS_STATE, OBS_ENV_STATE, ACTION, REWARD, DENSE_REWARD)
 
 
 @dataclass(frozen=True)
@@ -71,6 +81,7 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
 
     Raises:
         RuntimeError: if the expert fails an episode on every variation, `max_attempts` times each.
+        ValueError: if an observation, action or reward is not finite.
     """
     start = time.monotonic()
     temporary = folder / f"{TEMPORARY_PREFIX}{shard.name}-{os.getpid()}"
@@ -84,7 +95,10 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
     record = ShardRecord(made_of=shard.made_of(), episodes=[], failures={}, seconds=0.0, files={})
     for episode in range(shard.first, shard.first + shard.count):
         demonstration = _succeed(shard, episode, simulation, record)
-        for frame in dataset_frames(demonstration, simulation, renderers):
+        frames = dataset_frames(demonstration, simulation, renderers)
+        numbers = {key: np.stack([frame[key] for frame in frames]) for key in _FINITE}  # (T, ...) each
+        check_finite(numbers, where=f"{shard.task}, episode {episode}, variation {demonstration.variation}")
+        for frame in frames:
             dataset.add_frame(frame)
         dataset.save_episode()
         on_episode()

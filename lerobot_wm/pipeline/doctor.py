@@ -15,6 +15,7 @@ from huggingface_hub import constants, get_token
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
+from tqdm import tqdm
 
 from lerobot_wm.constants import ENV_TYPE
 from lerobot_wm.cores import usable_cores
@@ -204,7 +205,7 @@ def diagnose() -> list[Check]:
     return [
         check_python(),
         *check_packages(installed_versions()),
-        *[check() for check in single],
+        *[check() for check in tqdm(single, desc="Checking", unit="part", leave=False)],
         check_disk("disk, this folder", Path.cwd()),
         check_disk("disk, HF_HOME", Path(constants.HF_HOME)),
     ]

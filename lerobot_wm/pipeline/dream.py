@@ -1,25 +1,22 @@
 """`lerobot-wm dream`: what a world model imagines of an episode, as a video and a strip of pictures."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import draccus
+from lerobot.configs.default import WandBConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.io_utils import write_video
 
-from lerobot_wm.constants import REWARD
+from lerobot_wm.data.check import check_dataset
 from lerobot_wm.pipeline.quiet import quiet, silence
 from lerobot_wm.pipeline.source import SourceConfig
-from lerobot_wm.policies.latent_policy import LatentPolicy
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.report.dream import Dreams, dream, shapes_read
-from lerobot_wm.report.dream_figures import strip_figure, video_frames
+from lerobot_wm.pipeline.wandb_log import log_dream, wandb_run
+from lerobot_wm.report.dream import Dreams, dream
+from lerobot_wm.report.dream_clips import write_dream
+from lerobot_wm.report.dream_figures import strip_figure
+from lerobot_wm.report.episodes import check_features, read_episodes
 from lerobot_wm.report.inline import PNG, figure_bytes
 from lerobot_wm.report.open_loop import load_world_model
-
-VIDEO_FPS = 15  # at most: episodes of a second or two are over before anything is seen
 
 
 @dataclass
@@ -40,6 +37,7 @@ class DreamConfig:
         context: Frames at its beginning that the world model sees.
         horizon: Steps to imagine; None goes on to the end of the episode.
         output_dir: Where episode_N.mp4 and episode_N.png go.
+        wandb: `--wandb.enable=true` logs the dream to the run that trained the checkpoint.
     """
 
     policy: CheckpointConfig
@@ -48,6 +46,7 @@ class DreamConfig:
     context: int = 5
     horizon: int | None = None
     output_dir: Path = Path("outputs/dream")
+    wandb: WandBConfig = field(default_factory=WandBConfig)
 
 
 def dream_of(cfg: DreamConfig) -> Dreams:
@@ -58,17 +57,22 @@ def dream_of(cfg: DreamConfig) -> Dreams:
             size, or there is no such episode, or it is too short.
     """
     policy = load_world_model(cfg.policy.path)
+    check_dataset(cfg.dataset.repo_id, cfg.dataset.root)
     with quiet():
         meta = LeRobotDatasetMetadata(
             cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision
         )
-        _check_features(policy, meta)
-        episode = _read(cfg, meta, [*shapes_read(policy), *({REWARD} & meta.features.keys())])
+        check_features(policy, meta)
+        root, revision = cfg.dataset.root, cfg.dataset.revision
+        [episode] = read_episodes(policy, meta, root, [cfg.episode], _frames_read(cfg, meta), revision)
     dreams = dream(policy, episode, cfg.context)
     video, strip = outputs(cfg)
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
-    write_video(video, video_frames(dreams), min(meta.fps, VIDEO_FPS))
+    write_dream(video, dreams, meta.fps)
     strip.write_bytes(figure_bytes(strip_figure(dreams), PNG))
+    with wandb_run(cfg.wandb, Path(cfg.policy.path), cfg.output_dir) as run:
+        if run is not None:
+            log_dream(run, dreams, video, strip)
     return dreams
 
 
@@ -77,26 +81,8 @@ def outputs(cfg: DreamConfig) -> tuple[Path, Path]:
     return cfg.output_dir / f"episode_{cfg.episode}.mp4", cfg.output_dir / f"episode_{cfg.episode}.png"
 
 
-def _check_features(policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset without what the policy reads; images of any size are resized."""
-    shapes = shapes_read(policy)
-    missing = [key for key in shapes if key not in meta.features]
-    if missing:
-        raise ValueError(
-            f"{meta.repo_id} has no {', '.join(missing)}; it has {', '.join(sorted(meta.features))}. Give the "
-            "--dataset.repo_id of an image dataset like the one the world model was trained on."
-        )
-    for key in shapes.keys() - policy.config.cameras:
-        found = tuple(meta.features[key]["shape"])
-        if found != shapes[key]:
-            raise ValueError(
-                f"'{key}' of {meta.repo_id} is {found}, the checkpoint was trained on {shapes[key]}: "
-                "use the kind of dataset it was trained on."
-            )
-
-
-def _read(cfg: DreamConfig, meta: LeRobotDatasetMetadata, keys: list[str]) -> dict[str, Any]:
-    """The first frames of the episode, as many as are seen and imagined: (T, ·) by key, and its task."""
+def _frames_read(cfg: DreamConfig, meta: LeRobotDatasetMetadata) -> int:
+    """How many frames of the episode are seen and imagined."""
     if not 0 <= cfg.episode < meta.total_episodes:
         raise ValueError(
             f"--episode={cfg.episode}, but {meta.repo_id} has {meta.total_episodes} episodes: give one of "
@@ -113,15 +99,7 @@ def _read(cfg: DreamConfig, meta: LeRobotDatasetMetadata, keys: list[str]) -> di
             f"Episode {cfg.episode} has {length} frames; to see {cfg.context} and imagine {cfg.horizon or 'the rest'} "
             f"takes at least {max(n_frames, cfg.context + 1)}: lower --context or --horizon, or choose a longer one."
         )
-    times = [step / meta.fps for step in range(n_frames)]
-    dataset = LeRobotDataset(
-        meta.repo_id,
-        root=cfg.dataset.root,
-        revision=cfg.dataset.revision,
-        episodes=[cfg.episode],
-        delta_timestamps=dict.fromkeys(keys, times),
-    )
-    return dataset[0]
+    return n_frames
 
 
 def main() -> None:

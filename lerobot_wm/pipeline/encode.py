@@ -25,11 +25,11 @@ from lerobot_wm.hub.dataset_card import license_of, push_latents
 from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.pipeline.encode_episodes import episode_batches
 from lerobot_wm.pipeline.encode_parts import LatentParts
-from lerobot_wm.pipeline.quiet import quiet
+from lerobot_wm.pipeline.quiet import drop_remarks, quiet
 from lerobot_wm.pipeline.share import Share, refuse_difference
 from lerobot_wm.pipeline.source import SourceConfig
+from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_encoder import EncoderPolicy, load_encoder
-from lerobot_wm.world_model.model import WorldModel
 
 logger = logging.getLogger(__name__)
 
@@ -209,6 +209,7 @@ def _check_same(found: LatentRecord, expected: LatentRecord, root: Path) -> None
 
 def main() -> None:
     """Entry point of `lerobot-wm encode`."""
+    drop_remarks()
     cfg = draccus.parse(EncodeConfig)
     if cfg.push_to_hub:
         check_can_push(cfg.output_repo_id)
@@ -228,6 +229,6 @@ def main() -> None:
     print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames -> {cfg.output_root}")
     if cfg.push_to_hub:
         record = LatentRecord.read(cfg.output_root)
-        encoder = "world model" if isinstance(policy.world_model, WorldModel) else "image backbone"
+        encoder = "image backbone" if isinstance(policy.world_model, FrozenBackbone) else "world model"
         license = cfg.license or license_of(source)
         push_latents(dataset, record, encoder, cfg.world_model_path, cfg.private, license)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot.configs.default import EvalConfig
+from lerobot.configs.default import EvalConfig, WandBConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.envs.configs import EnvConfig
 
@@ -39,6 +39,8 @@ class EvaluateConfig(EvalPipelineConfig):
     num_workers: int = 1
     # How many rollouts of each task, the first ones, are kept as videos.
     videos_per_task: int = 1
+    # `--wandb.enable=true` logs the tables to the run that trained the policy.
+    wandb: WandBConfig = field(default_factory=WandBConfig)
 
     def validate(self) -> None:
         """Refuse what cannot run, before anything is loaded.

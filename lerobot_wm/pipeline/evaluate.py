@@ -20,7 +20,10 @@ from tqdm import tqdm
 
 from lerobot_wm.cores import usable_cores
 from lerobot_wm.pipeline.eval_config import EvaluateConfig
+from lerobot_wm.pipeline.processors import check_processors
+from lerobot_wm.pipeline.quiet import drop_remarks
 from lerobot_wm.pipeline.rollouts import TaskRunner, task_names
+from lerobot_wm.pipeline.wandb_log import log_evaluation, wandb_run
 from lerobot_wm.report.provenance import provenance
 from lerobot_wm.report.records import Record, record_line
 from lerobot_wm.report.statistics import ci95_summary, in_split
@@ -32,6 +35,7 @@ _worker_run: Callable[[str], list[Record]]
 
 def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
     global _worker_run
+    drop_remarks()
     torch.set_num_threads(threads)
     _worker_run = TaskRunner(cfg).run
 
@@ -41,10 +45,11 @@ def _run_in_worker(task: str) -> list[Record]:
 
 
 def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
-    """Records task by task, in the order of `tasks`."""
-    if cfg.num_workers == 1:
-        yield from map(TaskRunner(cfg).run, tasks)
-        return
+    """Records task by task, in the order of `tasks`; a single process has its policy when this returns."""
+    return map(TaskRunner(cfg).run, tasks) if cfg.num_workers == 1 else _rollouts_of_workers(cfg, tasks)
+
+
+def _rollouts_of_workers(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
     workers = min(cfg.num_workers, len(tasks))
     threads = max(1, usable_cores() // workers)
     with ProcessPoolExecutor(
@@ -60,20 +65,36 @@ def evaluate(cfg: EvaluateConfig) -> list[Record]:
 
     Raises:
         ValueError, FileExistsError: see `EvaluateConfig.validate`.
+        ValueError: the checkpoint's processors name code of their own.
     """
     cfg.validate()
+    check_processors(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
     tasks = task_names(cfg)
+    with wandb_run(cfg.wandb, cfg.policy.pretrained_path, cfg.output_dir) as run:
+        records = _write_records(cfg, tasks)
+        if run is not None:
+            log_evaluation(run, cfg.arm_name, records)
+    return records
+
+
+def _write_records(cfg: EvaluateConfig, tasks: list[str]) -> list[Record]:
     started = time.perf_counter()
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     cfg.records_file.parent.mkdir(parents=True, exist_ok=True)
     unfinished = cfg.records_file.with_name(cfg.records_file.name + ".part")
     records: list[Record] = []
-    with unfinished.open("w") as file, tqdm(total=len(tasks) * len(cfg.seeds), unit="rollout") as progress:
-        for of_task in _rollouts(cfg, tasks):
+    rollouts = _rollouts(cfg, tasks)  # LeRobot prints as it loads the policy: not into the bar
+    total = len(tasks) * len(cfg.seeds)
+    # Where there is no terminal, LeRobot's bar beneath this one would leave cursor movements in the file.
+    progress = tqdm(total=total, desc="Rolling out", unit="rollout", disable=None)
+    with unfinished.open("w") as file, progress:
+        for of_task in rollouts:
             records += of_task
             file.writelines(map(record_line, of_task))
             file.flush()
             progress.update(len(of_task))
+            if progress.disable:
+                logging.info("%d of %d rollouts", len(records), total)
     unfinished.rename(cfg.records_file)
     _write_info(cfg, records, seconds=time.perf_counter() - started)
     return records
@@ -108,5 +129,6 @@ def _evaluate_from_command_line(cfg: EvaluateConfig) -> None:
 def main() -> None:
     """Entry point of `lerobot-wm eval`."""
     init_logging()
+    drop_remarks()
     register_third_party_plugins()
     _evaluate_from_command_line()  # type: ignore[call-arg]

@@ -74,7 +74,9 @@ def roll_out_expert(cfg: ExpertConfig) -> list[Record]:
     cfg.validate()
     tasks = resolve_tasks(cfg.tasks)
     records = [
-        record for of_task in tqdm(_rollouts(cfg, tasks), total=len(tasks), unit="task") for record in of_task
+        record
+        for of_task in tqdm(_rollouts(cfg, tasks), total=len(tasks), desc="Rolling out", unit="task")
+        for record in of_task
     ]
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     unfinished = cfg.records_file.with_name(f"{cfg.records_file.name}.part")

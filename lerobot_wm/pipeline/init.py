@@ -15,6 +15,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_wm.pipeline.quiet import drop_remarks
 from lerobot_wm.pipeline.source import SourceConfig
 
 
@@ -61,5 +62,6 @@ def initialise(cfg: InitConfig) -> Path:
 
 def main() -> None:
     """Entry point of `lerobot-wm init`."""
+    drop_remarks()
     register_third_party_plugins()
     print(f"Untrained checkpoint: {initialise(draccus.parse(InitConfig))}")

@@ -39,6 +39,8 @@ from lerobot.datasets.utils import (
 )
 from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
 
+from lerobot_wm.data.check import check_dataset
+
 
 def merge_datasets(sources: list[Path], repo_id: str, root: Path) -> None:
     """Merge datasets of the same features, frame rate and codec, in their order, into one.
@@ -47,7 +49,12 @@ def merge_datasets(sources: list[Path], repo_id: str, root: Path) -> None:
         sources: their folders; each dataset is small enough for one data file and one file of episodes.
         repo_id: repository id of the result.
         root: its folder; must not exist yet.
+
+    Raises:
+        DatasetError: a source is not whole.
     """
+    for source in sources:
+        check_dataset(repo_id, source)
     first = LeRobotDatasetMetadata(repo_id, root=sources[0])
     merged = LeRobotDatasetMetadata.create(
         repo_id,

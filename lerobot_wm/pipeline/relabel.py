@@ -13,9 +13,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tqdm import tqdm
 
 from lerobot_wm.constants import REWARD
 from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.pipeline.quiet import drop_remarks
 from lerobot_wm.pipeline.source import SourceConfig
 
 RELABEL_RECORD = Path("meta", "relabel.json")
@@ -63,9 +65,13 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
     partial = output_root.with_name(f"{output_root.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     root = Path(source.root)
-    for folder in ("meta", "data", "videos"):
-        if (root / folder).is_dir():
-            shutil.copytree(root / folder, partial / folder)
+    files = [
+        path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*") if path.is_file()
+    ]
+    for path in tqdm(files, desc="Copying", unit="file"):
+        copy = partial / path.relative_to(root)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, copy)
     for file in (partial / "data").rglob("*.parquet"):
         _overwrite(file, {REWARD: reward})
     for file in (partial / "meta" / "episodes").rglob("*.parquet"):
@@ -96,6 +102,7 @@ def _overwrite(file: Path, sources: dict[str, str]) -> None:
 
 def main() -> None:
     """Entry point of `lerobot-wm relabel`."""
+    drop_remarks()
     cfg = draccus.parse(RelabelConfig)
     dataset = relabel(cfg.dataset.open(), cfg.reward, cfg.output_repo_id, cfg.output_root)
     print(f"{dataset.num_frames} frames with the reward {cfg.reward} -> {cfg.output_root}")

@@ -1,6 +1,5 @@
 """LeRobot's own `rollout`, arranged so that each seed of each task runs exactly once."""
 
-import json
 from contextlib import nullcontext
 from itertools import batched
 from pathlib import Path
@@ -8,9 +7,6 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
-from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError
-from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
@@ -19,6 +15,7 @@ from lerobot.utils.io_utils import write_video
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_wm.pipeline.eval_config import EvaluateConfig, variation_of
+from lerobot_wm.pipeline.training_run import training_config
 from lerobot_wm.report.records import Record
 
 VIDEO_SIZE = 256  # frames are enlarged by a whole factor up to this height (pixels)
@@ -26,15 +23,7 @@ VIDEO_SIZE = 256  # frames are enlarged by a whole factor up to this height (pix
 
 def training_seed(policy_path: Path | None) -> int | None:
     """The seed a checkpoint (folder or Hub id) was trained with; None when it does not tell."""
-    if policy_path is None:
-        return None
-    file = policy_path / TRAIN_CONFIG_NAME
-    if not policy_path.is_dir():
-        try:
-            file = Path(hf_hub_download(str(policy_path), TRAIN_CONFIG_NAME))
-        except EntryNotFoundError:
-            return None
-    return json.loads(file.read_text())["seed"] if file.exists() else None
+    return training_config(policy_path).get("seed")
 
 
 class TaskRunner:

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wm.data.check import check_dataset, damage_named
+from lerobot_wm.data.finite import check_finite_dataset
 from lerobot_wm.hub.errors import check_dataset_version
 
 
@@ -19,7 +21,12 @@ class SourceConfig:
         """The dataset, all of its episodes; downloaded where it is not on this machine.
 
         Raises:
+            DatasetError: It is not whole, or an observation, action or reward is not finite.
             HubRefusalError: It is to be downloaded, and has no such version.
         """
+        check_dataset(self.repo_id, self.root)
         check_dataset_version(self.repo_id, self.root, self.revision)
-        return LeRobotDataset(self.repo_id, root=self.root, revision=self.revision)
+        with damage_named(self.repo_id, self.root):
+            dataset = LeRobotDataset(self.repo_id, root=self.root, revision=self.revision)
+        check_finite_dataset(dataset)
+        return dataset

@@ -17,11 +17,16 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.scripts.lerobot_train import train as lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.logging_utils import MetricsTracker
+from torch import Tensor
 
 from lerobot_wm.constants import OBS_LATENT
+from lerobot_wm.data.check import check_dataset, damage_named
 from lerobot_wm.data.loader import RamLoader
 from lerobot_wm.hub.errors import check_can_push, check_dataset_version
+from lerobot_wm.pipeline.divergence import LossWatch
 from lerobot_wm.pipeline.encode import encode_to_cache
+from lerobot_wm.pipeline.processors import check_processors
+from lerobot_wm.pipeline.quiet import drop_remarks
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
@@ -42,6 +47,25 @@ class RamAccelerator(Accelerator):
     def __init__(self, train_config: TrainPipelineConfig, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self._train_config = train_config
+        self._watch = LossWatch()
+        self._loaders: list[RamLoader] = []  # that of the training data first
+
+    def prepare_model(self, model: Any, *args: Any, **kwargs: Any) -> Any:
+        """Prepare the policy as accelerate does, and watch its loss."""
+        prepared = super().prepare_model(model, *args, **kwargs)
+        self._watch.attach(prepared)
+        return prepared
+
+    def backward(self, loss: Tensor, **kwargs: Any) -> None:
+        """Go backward as accelerate does, and stop the training where that gives no finite gradient.
+
+        Raises:
+            DivergenceError: The loss or its gradient is NaN or infinite; the weights are still those before the step.
+        """
+        super().backward(loss, **kwargs)
+        if self.scaler is None:  # that of float16 skips such steps by itself
+            last = Path(self._train_config.output_dir) / "checkpoints" / "last"
+            self._watch.check(loss, self._loaders[0], last)
 
     def prepare_data_loader(self, data_loader: Any, *args: Any, **kwargs: Any) -> RamLoader:
         """Replace the loader by one that reads the same samples, this process's share of them, from memory.
@@ -53,7 +77,9 @@ class RamAccelerator(Accelerator):
         if self.num_processes > 1:
             batch_sampler = BatchSamplerShard(batch_sampler, self.num_processes, self.process_index)
         with self.in_turn():  # the first decodes the frames, the others map them
-            return RamLoader(data_loader, batch_sampler, self.device, cameras_to_serve(self._train_config))
+            loader = RamLoader(data_loader, batch_sampler, self.device, cameras_to_serve(self._train_config))
+        self._loaders.append(loader)
+        return loader
 
     @contextmanager
     def in_turn(self) -> Iterator[None]:
@@ -162,21 +188,26 @@ def train(cfg: TrainPipelineConfig) -> None:
         )
     if cfg.dataset.streaming:
         raise ValueError("--dataset.streaming=true reads no dataset into memory: use lerobot-train for it.")
+    if cfg.policy.pretrained_path is not None:
+        check_processors(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
     accelerator = make_accelerator(cfg)
     if cfg.policy.push_to_hub and accelerator.is_main_process:
         check_can_push(cfg.policy.repo_id)  # now, not when hours of training are over
+    check_dataset(cfg.dataset.repo_id, cfg.dataset.root)
     check_dataset_version(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     with accelerator.in_turn():
         encode_if_needed(cfg)
     log = TrainLog(cfg.output_dir)
     logging.getLogger().addFilter(log)
     try:
-        lerobot_train(cfg, accelerator=accelerator)
+        with damage_named(cfg.dataset.repo_id, cfg.dataset.root):
+            lerobot_train(cfg, accelerator=accelerator)
     finally:
         logging.getLogger().removeFilter(log)
 
 
 def main() -> None:
     """Entry point of `lerobot-wm train`."""
+    drop_remarks()
     register_third_party_plugins()
     train()

@@ -12,21 +12,20 @@ from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.policies.cameras import camera_images, check_images, side_by_side
 from lerobot_wm.policies.features import stat
-from lerobot_wm.policies.frozen_encoder import LatentState
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
-from lerobot_wm.policies.latent_setup import adopt_encoder, check_latents, deployed_features, make_encoder
+from lerobot_wm.policies.latent_setup import check_latents, deployed_features, take_world_model
 from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
-from lerobot_wm.world_model.model import WorldModel
-from lerobot_wm.world_model.rssm import RSSMState
+from lerobot_wm.world_model.interface import LatentModel, LatentState
 
 
 class LatentPolicy(MultiTaskPolicy):
-    """Base of `wm_bc` and `wm_iql`: holds the frozen world model, or backbone in its place, and the filter's state.
+    """Base of `wm_bc` and `wm_iql`: holds the frozen world model, or what stands in its place, and the filter's state.
 
     Subclasses define `actor_mean` and `forward`.
     """
 
     config: LatentPolicyConfig
+    world_model: LatentModel  # with `use_latent`
 
     def __init__(
         self,
@@ -34,18 +33,14 @@ class LatentPolicy(MultiTaskPolicy):
         dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
-        encoder = None
-        if config.use_latent and config.rssm is None and config.frozen_backbone is None:  # made new
-            encoder = adopt_encoder(config)
+        world_model = take_world_model(config) if config.use_latent else None
         config.input_features = deployed_features(config)
         if config.use_latent and dataset_meta is not None:  # to be trained
             check_latents(config, dataset_meta)
         super().__init__(config, dataset_stats, dataset_meta)
-        if config.use_latent:
-            self.world_model = make_encoder(config) if encoder is None else encoder
-            self.world_model.requires_grad_(False)
-        if config.frozen_backbone is not None:
-            # A world model's latents come in a range of about one; a backbone's features in any.
+        if world_model is not None:
+            self.world_model = world_model.requires_grad_(False)
+        if config.scales_latents:
             self.latent_scaling = Affine(config.latent_dim)
             if dataset_stats is not None:
                 self.latent_scaling.set_standard(
@@ -87,8 +82,7 @@ class LatentPolicy(MultiTaskPolicy):
         """
         parts = [tasks, self.state_scaling(state)]
         if latent is not None:
-            scaled = latent if self.config.frozen_backbone is None else self.latent_scaling(latent)
-            parts.insert(0, scaled)
+            parts.insert(0, self.latent_scaling(latent) if self.config.scales_latents else latent)
         if env_state is not None:
             parts.append(self.env_state_scaling(env_state))
         return torch.cat(parts, dim=-1)
@@ -164,34 +158,28 @@ class LatentPolicy(MultiTaskPolicy):
             self._filter_state = None
             self._prev_action = images.new_zeros(images.shape[0], self.config.action_dim)
         states = self.world_model.observe(
-            images[:, None],
-            self._prev_action[:, None],
-            self._filter_state,  # type: ignore[arg-type]  # of the encoder's own kind
-            batch[OBS_STATE][:, None],
+            images[:, None], self._prev_action[:, None], self._filter_state, batch[OBS_STATE][:, None]
         )
         self._filter_state = states.last()
         if self.config.save_predicted_video:
-            self.last_predicted_latents = self._predicted_and_seen(images)
+            expected = self.world_model.expected_images(self._filter_state)
+            self.last_predicted_latents = self._expected_and_seen(expected, images)
         return self._filter_state.latent
 
-    def _predicted_and_seen(self, images: Tensor) -> Tensor:
-        """What the world model expected to see, from s_{t-1} and a_{t-1}, and on its right what it saw.
+    def _expected_and_seen(self, expected: Tensor, images: Tensor) -> Tensor:
+        """What the world model expected to see, and on its right what it saw.
 
         They are pictures already: one of LeRobot's videos shows a whole batch, and it decodes latents alone.
 
         Args:
+            expected: Its `expected_images`, (B, K·C, H, W) in [0, 1].
             images: o_t, (B, K·C, H, W) in [0, 1].
 
         Returns:
             One pair for each of the B environments, as tiles of one picture: (1, C, 1, H', W') uint8.
         """
-        world_model, state = self.world_model, self._filter_state
-        assert isinstance(world_model, WorldModel)  # as the configuration checked
-        assert isinstance(state, RSSMState)
-        # d_t does not depend on o_t; z_t as expected without it is the prior's.
-        prior = RSSMState(state.deter, world_model.rssm.prior(state.deter).mean)
-        both = (world_model.decode(prior.latent), images)
-        pairs = torch.cat([side_by_side(image, len(self.config.cameras)) for image in both], dim=-1)
+        both = (side_by_side(image, len(self.config.cameras)) for image in (expected, images))
+        pairs = torch.cat(list(both), dim=-1)
         grid = make_grid(pairs, nrow=math.ceil(pairs.shape[0] ** 0.5))  # (C, H', W')
         return (255 * grid).round().byte()[None, :, None]
 

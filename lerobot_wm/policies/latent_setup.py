@@ -1,50 +1,45 @@
-"""What a policy on latents settles when it is made: its encoder, what it reads, and that latents are its own."""
+"""What a policy on latents settles when it is made: its world model, what it reads, and that latents are its own."""
 
 from pathlib import Path
 
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies.factory import get_policy_class
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.data.fingerprint import weights_fingerprint
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.policies.features import stat
-from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_encoder import load_encoder
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
-from lerobot_wm.world_model.model import WorldModel
+from lerobot_wm.world_model.interface import LatentModel
 
-_MIN_FEATURE_STD = 1e-5  # below it, scaling features to unit variance would scale rounding errors
+_MIN_LATENT_STD = 1e-5  # below it, scaling latents to unit variance would scale rounding errors
 
 
-def adopt_encoder(config: LatentPolicyConfig) -> WorldModel | FrozenBackbone:
-    """Load the world model, or the backbone in its place, and note its sizes in `config`.
+def take_world_model(config: LatentPolicyConfig) -> LatentModel:
+    """The world model of a policy: that of its path where the policy is new, one to be filled with weights else.
+
+    A new policy's `config` is told which it is, and of its cameras.
 
     Raises:
-        ValueError: `world_model_path` is not given, or is no checkpoint of either.
+        ValueError: `world_model_path` is not given, or is no checkpoint with a world model.
     """
+    if config.world_model is not None:
+        return get_policy_class(config.world_model.type)(config.world_model).world_model
     if config.world_model_path is None:
         raise ValueError(
             f"--policy.type={config.type} needs --policy.world_model_path=<folder or Hub id of a wm_rssm checkpoint>."
         )
     policy = load_encoder(config.world_model_path)
-    encoder = policy.world_model
-    if isinstance(encoder, WorldModel):
-        config.rssm = encoder.config
-    else:
-        config.frozen_backbone = encoder.config
+    # Of a policy on latents, its world model's.
+    config.world_model = (
+        policy.config.world_model if isinstance(policy.config, LatentPolicyConfig) else policy.config
+    )
     config.image_key = policy.config.image_key
     config.input_features |= {key: policy.config.input_features[key] for key in policy.config.cameras}
-    config.world_model_fingerprint = weights_fingerprint(encoder)
-    return encoder
-
-
-def make_encoder(config: LatentPolicyConfig) -> WorldModel | FrozenBackbone:
-    """The encoder a checkpoint's configuration describes, to be filled with its weights."""
-    if config.rssm is not None:
-        return WorldModel(config.rssm)
-    assert config.frozen_backbone is not None  # adopted, if it was not in the checkpoint
-    return FrozenBackbone(config.frozen_backbone)
+    config.world_model_fingerprint = weights_fingerprint(policy.world_model)
+    return policy.world_model
 
 
 def deployed_features(config: LatentPolicyConfig) -> dict[str, PolicyFeature]:
@@ -61,7 +56,7 @@ def deployed_features(config: LatentPolicyConfig) -> dict[str, PolicyFeature]:
 
 
 def check_latents(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset without latents, with those of another world model, or with features that hold nothing.
+    """Refuse a dataset without latents, with those of another world model, or with latents that hold nothing.
 
     The policy is then for cameras of the size that the latents were made from, whatever the world model was trained on.
 
@@ -78,11 +73,12 @@ def check_latents(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetada
     record.check_world_model(config.world_model_fingerprint, config.world_model_path)
     for key, shape in record.camera_shapes.items():
         config.input_features[key] = PolicyFeature(FeatureType.VISUAL, tuple(shape))
-    if config.frozen_backbone is not None:
+    if config.scales_latents:
         std = stat(dataset_meta.stats, OBS_LATENT, "std").median().item()
-        if std < _MIN_FEATURE_STD:
+        if std < _MIN_LATENT_STD:
             raise ValueError(
-                f"The features of {config.frozen_backbone.name} hardly vary (median standard deviation {std:.1e}): "
-                "without trained weights its signal fades from layer to layer. Give --policy.weights_path to "
-                "`lerobot-wm init`, or choose a residual network such as resnet18."
+                f"The latents of {config.world_model_path} hardly vary (median standard deviation {std:.1e}): a policy "
+                "would be blind. Of an image backbone without trained weights the signal fades from layer to layer: "
+                "give --policy.weights_path to `lerobot-wm init`, or choose a residual network such as resnet18. A "
+                "world model whose latents are all the same needs another training loss."
             )

@@ -4,13 +4,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import draccus
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.import_utils import register_third_party_plugins
 from rich.console import Console
 
+from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.curves import curve_figures, read_logs
+from lerobot_wm.report.data_summary import summarise_data
+from lerobot_wm.report.dream_clips import dream_clips
+from lerobot_wm.report.episodes import check_features
 from lerobot_wm.report.inline import PNG, SVG, data_uri, figure_bytes
+from lerobot_wm.report.latents import latent_figures, latent_map
 from lerobot_wm.report.open_loop import load_world_model, open_loop, strips_figure
-from lerobot_wm.report.page import page_of_records
+from lerobot_wm.report.page import Page, page_of_records
 from lerobot_wm.report.provenance import provenance
 from lerobot_wm.report.quality_page import quality_section
 from lerobot_wm.report.records import find_records, read_records
@@ -22,7 +29,7 @@ TERMINAL_WIDTH = 100
 
 @dataclass
 class ReportDatasetConfig:
-    """The dataset whose episodes the world model predicts."""
+    """The dataset that the page describes, and whose episodes the world model imagines."""
 
     repo_id: str | None = None
     root: str | None = None
@@ -40,22 +47,22 @@ class ReportConfig:
     videos: str | None = None
     # Output folders of `lerobot-wm train` whose curves are shown.
     train_logs: str | None = None
-    # Checkpoint of wm_rssm, wm_bc or wm_iql whose predictions on `--dataset.*` are shown.
+    # Checkpoint of wm_rssm, wm_bc or wm_iql whose dreams, predictions and latents of `--dataset.*` are shown.
     world_model_path: str | None = None
     dataset: ReportDatasetConfig = field(default_factory=ReportDatasetConfig)
     # quality.json of `lerobot-wm quality`, whose section is included.
     quality: Path | None = None
 
     def validate(self) -> None:
-        """Refuse half of a pair of flags.
+        """Refuse a world model that has nothing to imagine.
 
         Raises:
-            ValueError: a world model without a dataset, or a dataset without a world model.
+            ValueError: a world model without a dataset.
         """
-        if (self.world_model_path is None) != (self.dataset.repo_id is None):
+        if self.world_model_path is not None and self.dataset.repo_id is None:
             raise ValueError(
-                "Open-loop prediction needs both --world_model_path and --dataset.repo_id (and --dataset.root "
-                f"for a local one); found {self.world_model_path} and {self.dataset.repo_id}."
+                f"--world_model_path={self.world_model_path} needs --dataset.repo_id (and --dataset.root for a local "
+                "one) as well: the image dataset whose episodes it shall imagine."
             )
 
 
@@ -69,6 +76,12 @@ def report(cfg: ReportConfig) -> Path:
         ValueError, FileNotFoundError: an input is missing or is not what its flag takes.
     """
     cfg.validate()
+    meta = policy = None
+    if cfg.dataset.repo_id is not None:
+        meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root)
+        if cfg.world_model_path is not None:
+            policy = load_world_model(cfg.world_model_path)
+            check_features(policy, meta)
     records = read_records(find_records(cfg.records))
     evaluations = [read_evaluation(folder) for folder in _paths(cfg.videos)]
     clips = [clip for evaluation in evaluations for clip in evaluation.clips]
@@ -78,13 +91,12 @@ def report(cfg: ReportConfig) -> Path:
     page.curves = [data_uri(figure_bytes(figure, SVG), SVG) for figure in curves]
     if cfg.quality is not None:
         page.quality = quality_section(cfg.quality)
+    if meta is not None:
+        page.data = summarise_data(meta, cfg.dataset.root)
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
-    if cfg.world_model_path is not None and cfg.dataset.repo_id is not None:
-        page.dataset = cfg.dataset.repo_id
-        page.open_loop = open_loop(load_world_model(cfg.world_model_path), page.dataset, cfg.dataset.root)
-        picture = figure_bytes(strips_figure(page.open_loop), PNG)
+    if meta is not None and policy is not None:
+        picture = _show_world_model(page, policy, meta, cfg.dataset.root)
         (cfg.output_dir / "open_loop.png").write_bytes(picture)
-        page.strips = data_uri(picture, PNG)
 
     tables = [*page.tables, page.paper_table, *page.comparison_tables]
     shown = [table for table in tables if table is not None]
@@ -95,6 +107,20 @@ def report(cfg: ReportConfig) -> Path:
     index = cfg.output_dir / "index.html"
     index.write_text(page.html())
     return index
+
+
+def _show_world_model(
+    page: Page, policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, root: str | None
+) -> bytes:
+    """Put on the page what a world model imagines of a dataset and knows of it; returns the strips as a PNG file."""
+    page.dataset = meta.repo_id
+    page.open_loop = open_loop(policy, meta.repo_id, root)
+    picture = figure_bytes(strips_figure(page.open_loop), PNG)
+    page.strips = data_uri(picture, PNG)
+    page.dreams = dream_clips(policy, meta, root)
+    page.latents = latent_map(policy, meta, root)
+    page.latent_pictures = [data_uri(figure_bytes(f, PNG), PNG) for f in latent_figures(page.latents)]
+    return picture
 
 
 def _paths(comma_separated: str | None) -> list[Path]:

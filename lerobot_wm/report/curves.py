@@ -24,7 +24,7 @@ def read_logs(runs: list[Path]) -> dict[str, Curves]:
     """
     if not runs:
         return {}
-    common = os.path.commonpath([run.parent for run in runs])
+    common = os.path.commonpath([run.absolute().parent for run in runs])
     return {os.path.relpath(run, common): read_curves(run) for run in runs}
 
 
@@ -45,7 +45,8 @@ def read_curves(run: Path) -> Curves:
         step = entry.pop("step")
         for name in entry.keys() - BOOKKEEPING:
             curves.setdefault(name, []).append((step, entry[name]))
-    return curves
+    # A run that was stopped and went on from a checkpoint logs some steps again: what it logged last counts.
+    return {name: sorted(dict(points).items()) for name, points in curves.items()}
 
 
 def curve_figures(runs: dict[str, Curves]) -> list[Figure]:

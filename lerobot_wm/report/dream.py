@@ -6,10 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, REWARD, TASK
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, TASK
 from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from lerobot_wm.report.episodes import reward_key, shapes_read
 from lerobot_wm.report.open_loop import psnr
 from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import RSSMState
@@ -34,13 +35,14 @@ class Dreams:
     """An episode's first T frames, of which `context` are seen, and dreams of them by kind of action, on the CPU.
 
     `truth` (T, K·C, 64, 64) holds the images of K cameras as the world model is shown them. `reward` (T,) is what
-    arrived at frame t + 1; None where the dataset has none.
+    arrived at frame t + 1, of the column `reward_key`; None where the dataset does not have it.
     """
 
     context: int
     n_cameras: int
     truth: Tensor
     reward: Tensor | None
+    reward_key: str
     dreams: dict[str, Dream]
 
     def psnr(self) -> float:
@@ -55,13 +57,6 @@ class Dreams:
         return psnr((images - self.truth[self.context :]).square().mean().item())
 
 
-def shapes_read(policy: WMRSSMPolicy | LatentPolicy) -> dict[str, tuple[int, ...]]:
-    """Keys that dreams read from a dataset, with their shapes in training (cameras: C, H, W)."""
-    config = policy.config
-    shapes = {key: tuple(config.input_features[key].shape) for key in config.features_read}
-    return shapes | {ACTION: tuple(config.output_features[ACTION].shape)}
-
-
 @torch.no_grad()
 def dream(policy: WMRSSMPolicy | LatentPolicy, episode: dict[str, Any], context: int) -> Dreams:
     """Filter the first frames of an episode and imagine the others, always taking the mean of z_t.
@@ -74,15 +69,15 @@ def dream(policy: WMRSSMPolicy | LatentPolicy, episode: dict[str, Any], context:
     Args:
         policy: Holds the world model.
         episode: Its first T frames: each camera (T, C, H, W) in [0, 1], `action` (T, A), what else
-            `shapes_read` names (T, ·), `task`, and `next.reward` (T,) where there is one.
+            `shapes_read` names (T, ·), `task`, and the model's reward (T,) where there is one; as of `read_episodes`.
         context: How many of them the model sees.
 
     Raises:
         ValueError: The policy does not know the task.
     """
-    config, world_model = policy.config, policy.world_model
+    config, world_model, key = policy.config, policy.world_model, reward_key(policy)
     assert isinstance(world_model, WorldModel)  # as load_world_model checked
-    batch = {key: episode[key][None].to(config.device) for key in shapes_read(policy)}  # (1, T, ·) each
+    batch = {name: episode[name][None].to(config.device) for name in shapes_read(policy)}  # (1, T, ·) each
     images, actions = camera_images(config, batch), batch[ACTION]  # (1, T, K·C, 64, 64), (1, T, A)
     proprio = batch[OBS_STATE][:, :context] if world_model.config.use_proprio else None
     seen = world_model.filter(images[:, :context], actions[:, :context], proprio)
@@ -106,7 +101,8 @@ def dream(policy: WMRSSMPolicy | LatentPolicy, episode: dict[str, Any], context:
         context=context,
         n_cameras=len(config.cameras),
         truth=images[0].cpu(),
-        reward=episode.get(REWARD),
+        reward=episode[key].float() if key in episode else None,  # next.success is stored as bool
+        reward_key=key,
         dreams={name: told(latents) for name, latents in imagined.items()},
     )
 

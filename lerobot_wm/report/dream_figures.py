@@ -10,7 +10,6 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from lerobot_wm.constants import REWARD
 from lerobot_wm.report.dream import OWN_ACTIONS, TRUE_ACTIONS, ZERO_ACTIONS, Dreams
 
 # Colour-blind safe (Okabe and Ito 2008), blue as on the page; dashes hide nothing where curves are equal.
@@ -58,7 +57,9 @@ def _draw_rewards(axes: Axes, dreams: Dreams) -> None:
     """Reward against the frame it arrives with; the first frame has none."""
     steps = np.arange(1, len(dreams.truth))
     if dreams.reward is not None:
-        axes.plot(steps, dreams.reward[:-1], color="black", linewidth=1.2, label=f"truth ({REWARD})")
+        axes.plot(
+            steps, dreams.reward[:-1], color="black", linewidth=1.2, label=f"truth ({dreams.reward_key})"
+        )
     for name, dream in dreams.dreams.items():
         assert dream.reward is not None  # the world model has a reward head
         colour, style = STYLES[name]

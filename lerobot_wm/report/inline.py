@@ -5,7 +5,7 @@ from base64 import b64encode
 
 from matplotlib.figure import Figure
 
-SVG, PNG, MP4 = "image/svg+xml", "image/png", "video/mp4"
+SVG, PNG, WEBP, MP4 = "image/svg+xml", "image/png", "image/webp", "video/mp4"
 
 
 def data_uri(content: bytes, mime_type: str) -> str:

@@ -6,15 +6,14 @@ from textwrap import fill
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.factory import get_policy_class
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.policies.cameras import camera_images, side_by_side
+from lerobot_wm.policies.frozen_encoder import load_encoder
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.model import WorldModel
@@ -43,16 +42,16 @@ class OpenLoop:
 
 
 def load_world_model(path: str) -> WMRSSMPolicy | LatentPolicy:
-    """A checkpoint (folder or Hub id) that holds a world model: wm_rssm, or a policy on its latents.
+    """A checkpoint, see `load_encoder`, that holds an RSSM: wm_rssm, or a policy on its latents.
 
     Raises:
         ValueError: the checkpoint holds none.
     """
-    config = PreTrainedConfig.from_pretrained(path)
-    policy = get_policy_class(config.type).from_pretrained(path, config=config)
-    if not isinstance(policy, WMRSSMPolicy | LatentPolicy) or policy.config.rssm is None:
+    policy = load_encoder(path)
+    if not isinstance(policy, WMRSSMPolicy | LatentPolicy) or not isinstance(policy.world_model, WorldModel):
         raise ValueError(
-            f"{path} ({config.type}) holds no world model: give a wm_rssm, wm_bc or wm_iql checkpoint."
+            f"{path} ({policy.config.type}) holds no world model that imagines images: give a wm_rssm checkpoint, or "
+            "one of a policy on its latents."
         )
     return policy.eval()
 
@@ -129,7 +128,13 @@ def strips_figure(results: list[OpenLoop]) -> Figure:
         above[0].imshow(_pixels(result.truth[CONTEXT - 1]))
         above[0].set_title("last seen", fontsize=8)
         name = below[0].text(
-            0, 0.5, fill(result.task, 14), fontsize=8, transform=below[0].transAxes, va="center"
+            0,
+            0.5,
+            fill(result.task, 14),
+            fontsize=8,
+            transform=below[0].transAxes,
+            va="center",
+            parse_math=False,  # a task may speak of $
         )
         name.set_in_layout(False)  # or it would widen its column
         for column, horizon in enumerate(HORIZONS, start=1):

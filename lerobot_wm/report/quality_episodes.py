@@ -10,6 +10,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, SUCCESS, VARIATION
 from lerobot_wm.data.cache import camera_frames
+from lerobot_wm.data.check import check_dataset
 from lerobot_wm.data.tables import column_tensor
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.cameras import stack_images
@@ -76,8 +77,10 @@ def read_episodes(
     """Episodes of a Meta-World dataset; only those chosen are decoded.
 
     Raises:
+        DatasetError: The dataset is not whole.
         ValueError: The dataset lacks a feature, such as the objects' true positions.
     """
+    check_dataset(repo_id, root)
     dataset = LeRobotDataset(repo_id, root=root)
     missing = [key for key in (*cameras, *NEEDED) if key not in dataset.meta.features]
     if missing:

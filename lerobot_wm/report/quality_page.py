@@ -33,7 +33,7 @@ class Table:
 
 
 def quality_section(path: Path) -> str:
-    """HTML of `<h2>World-model quality</h2>` and what follows, figures inlined; styled by the page's classes.
+    """HTML of `<h3>World-model quality</h3>` and what follows, figures inlined; styled by the page's classes.
 
     Args:
         path: A quality.json of `lerobot-wm quality`, with the picture of examples beside it.

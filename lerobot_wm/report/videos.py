@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot_wm.report.inline import MP4, data_uri
 
-# All videos of a page together; as data URIs they take a third more. 500 steps at 256x256 take 150 kB.
+# All videos of the grid together; as data URIs they take a third more. 500 steps at 256x256 take 150 kB.
 MAX_VIDEO_BYTES = 12_000_000
 
 
@@ -26,6 +26,12 @@ class Clip:
     def src(self) -> str:
         """The video as a data URI."""
         return data_uri(self.path.read_bytes(), MP4)
+
+    @property
+    def caption(self) -> str:
+        """What it shows."""
+        outcome = "success" if self.success else "failure"
+        return f"{self.task}, {self.arm}, variation {self.variation}: {outcome}"
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,12 @@ from lerobot_wm.nn.conv import EMBED_DIM, ConvDecoder, ConvEncoder
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.world_model.config import RSSMConfig
+from lerobot_wm.world_model.interface import LatentModel
 from lerobot_wm.world_model.losses import reconstruction_loss, world_model_loss
 from lerobot_wm.world_model.rssm import RSSM, RSSMState
 
 
-class WorldModel(nn.Module):
+class WorldModel(LatentModel):
     """An RSSM on images and actions only: no task id, and no proprioception unless `config.use_proprio`.
 
     Time: frame t holds the image o_t, the action a_t executed there and the reward r_t that arrives with
@@ -112,6 +113,11 @@ class WorldModel(nn.Module):
         """Images (..., C, 64, 64), clipped to [0, 1], from latents (..., D+S)."""
         lead = latents.shape[:-1]
         return self.decoder(latents.flatten(0, -2)).float().clamp(0, 1).unflatten(0, lead)
+
+    def expected_images(self, state: RSSMState) -> Tensor:
+        """What o_t was expected to be, from s_{t-1} and a_{t-1} alone: (B, C, 64, 64) for the s_t (B, ·) it led to."""
+        # d_t does not depend on o_t; z_t as expected without it is the prior's.
+        return self.decode(RSSMState(state.deter, self.rssm.prior(state.deter).mean).latent)
 
     def predict_reward(self, latents: Tensor) -> Tensor:
         """The reward r_{t-1} that arrived with frame t, (...), from latents s_t (..., D+S)."""

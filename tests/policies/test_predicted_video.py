@@ -20,6 +20,7 @@ from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.world_model.config import RSSMConfig
 from tests.report.quality_model import lively_world_model
 
@@ -36,9 +37,11 @@ def make_policy(policy_type: str, cameras: list[str], **settings: Any) -> Latent
     images = {key: PolicyFeature(FeatureType.VISUAL, (3, 64, 64)) for key in cameras}
     inputs = {**images, OBS_STATE: PolicyFeature(FeatureType.STATE, (4,))}
     outputs = {ACTION: PolicyFeature(FeatureType.ACTION, (4,))}
-    defaults = {"rssm": rssm, "image_key": ",".join(cameras), "device": "cpu", "push_to_hub": False}
+    image_key = ",".join(cameras)
+    shared = {"input_features": inputs, "output_features": outputs, "image_key": image_key, "device": "cpu"}
+    defaults = {"world_model": WMRSSMConfig(rssm=rssm, **shared), "push_to_hub": False, **shared}
     tasks = [task_description("window-close-v3"), task_description("reach-v3")]
-    config = config_class(input_features=inputs, output_features=outputs, tasks=tasks, **defaults | settings)
+    config = config_class(tasks=tasks, **defaults | settings)
     return policy_class(config).eval()
 
 
@@ -128,7 +131,9 @@ def test_nothing_is_decoded_unless_asked_for(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_without_a_world_model_nothing_predicts() -> None:
     with pytest.raises(ValueError, match=r"save_predicted_video=true, but this wm_bc has no world model"):
-        make_policy("wm_bc", [], rssm=None, use_latent=False, image_key=None, save_predicted_video=True)
+        make_policy(
+            "wm_bc", [], world_model=None, use_latent=False, image_key=None, save_predicted_video=True
+        )
 
 
 @pytest.mark.parametrize("policy_type", POLICIES)

@@ -14,6 +14,7 @@ from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.open_loop import WINDOW
+from lerobot_wm.report.quality import QualityConfig, QualityDatasetConfig, quality
 from lerobot_wm.report.records import Record, record_line
 from lerobot_wm.world_model.config import RSSMConfig
 
@@ -101,3 +102,11 @@ def world_model_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("wm_rssm")
     policy.save_pretrained(path)
     return path
+
+
+@pytest.fixture(scope="session")
+def quality_path(demos_root: Path, world_model_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The quality.json of the untrained world model on the demonstrations, probed by cross-validation."""
+    dataset = QualityDatasetConfig("test/demos", str(demos_root))
+    folder = tmp_path_factory.mktemp("quality")
+    return quality(QualityConfig(str(world_model_path), dataset, folder, episodes_per_task=3))

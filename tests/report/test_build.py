@@ -15,7 +15,9 @@ from PIL import Image
 from lerobot_wm import cli
 from lerobot_wm.report import build, videos
 from lerobot_wm.report.build import ReportConfig, ReportDatasetConfig, report
+from lerobot_wm.report.inline import MP4, data_uri
 from lerobot_wm.report.records import record_line
+from tests.recording import record_stranger
 
 VOID = {"meta", "img", "br"}
 
@@ -26,11 +28,15 @@ class Page(HTMLParser):
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.open, self.sources, self.captions, self.headings, self.text = [], [], [], [], ""
+        self.links, self.anchors = [], []
         self.feed(path.read_text())
         assert not self.open
+        assert self.links == [f"#{anchor}" for anchor in self.anchors], "the contents list every section"
 
     def handle_starttag(self, tag: str, attrs: list) -> None:
-        self.sources += [(tag, value) for name, value in attrs if name in ("src", "href", "data-src")]
+        self.sources += [(tag, value) for name, value in attrs if name in ("src", "data-src")]
+        self.links += [value for name, value in attrs if name == "href"]
+        self.anchors += [value for name, value in attrs if tag == "section" and name == "id"]
         self.captions += [value for name, value in attrs if name == "data-caption"]
         if tag not in VOID:
             self.open.append(tag)
@@ -57,11 +63,10 @@ def test_records_alone(
 
     page = Page(tmp_path / "report" / "index.html")
     assert page.headings == [
-        "Success per task",
-        "All tasks",
-        "Paired comparisons",
-        "Which variations fail",
-        "Where this comes from",
+        "What was trained, and on what",
+        "How well it works",
+        "Watch it",
+        "How to make it again",
     ]
     assert "R&D <1>" in page.text
     assert re.search(r"100% +50/50\s+\[93, 100\]", page.text)
@@ -105,24 +110,47 @@ def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, 
         )
     )
     page = Page(index)
-    assert page.headings[-4:] == [
-        "Which variations fail",
-        "Open-loop prediction",
-        "Training",
-        "Where this comes from",
+    assert page.headings == [
+        "What was trained, and on what",
+        "How well it works",
+        "Watch it",
+        "What the world model imagines",
+        "What the world model knows",
+        "How training went",
+        "How to make it again",
     ]
     kinds = [(tag, source.split(";")[0]) for tag, source in page.sources]
     assert kinds == [
+        ("img", "data:image/webp"),  # how each task begins
+        ("img", "data:image/webp"),
         ("img", "data:image/svg+xml"),  # seen and unseen
+        ("video", "data:video/mp4"),  # the first failure, and where it stands in the grid
         ("button", "data:video/mp4"),
+        ("video", "data:video/mp4"),  # a dream of each task, as a video and a strip
         ("img", "data:image/png"),
+        ("video", "data:video/mp4"),
+        ("img", "data:image/png"),
+        ("img", "data:image/png"),  # open loop
+        ("img", "data:image/png"),  # latents by task
+        ("img", "data:image/png"),  # latents by time
         ("img", "data:image/svg+xml"),  # kl
         ("img", "data:image/svg+xml"),  # loss
     ], "everything is in the page, and nothing else is loaded"
     assert page.captions == ["reach-v3, wm_bc, variation 4: failure"]
     assert "lerobot-wm eval --arm=wm_bc" in page.text
+    assert "The data: test/episodes" in page.text
+    assert "116, 0.0 minutes at 80 frames per second" in page.text
     with Image.open(tmp_path / "report" / "open_loop.png") as picture:
         assert picture.width > 600
+
+
+def test_a_dataset_alone_is_described(records_file: Path, tmp_path: Path, episodes_root: Path) -> None:
+    dataset = ReportDatasetConfig("test/episodes", str(episodes_root))
+    index = report(ReportConfig(records=str(records_file), output_dir=tmp_path / "report", dataset=dataset))
+    page = Page(index)
+    assert len(page.headings) == 4
+    assert "The data: test/episodes" in page.text
+    assert not (tmp_path / "report" / "open_loop.png").exists()
 
 
 def test_videos_beyond_the_limit_are_counted(
@@ -137,6 +165,19 @@ def test_videos_beyond_the_limit_are_counted(
     page = Page(index)
     assert page.captions == ["reach-v3, wm_bc, variation 4: failure"]
     assert "1 of the 2 kept" in page.text
+
+
+def test_a_success_and_a_failure_are_shown_first(records_file: Path, tmp_path: Path) -> None:
+    names = [f"variation_{number:02}_{outcome}" for number in (0, 1) for outcome in ("success", "failure")]
+    folder = write_evaluation(tmp_path / "eval", *names)
+    index = report(
+        ReportConfig(records=str(records_file), output_dir=tmp_path / "report", videos=str(folder))
+    )
+    page = Page(index)
+    shown = [source for tag, source in page.sources if tag == "video"]
+    first = [folder / "videos" / "reach-v3" / f"variation_00_{o}.mp4" for o in ("success", "failure")]
+    assert shown == [data_uri(path.read_bytes(), MP4) for path in first]
+    assert "reach-v3, wm_bc, variation 0: success" in page.text
 
 
 def test_quality_is_included(records_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,6 +201,21 @@ def test_training_seeds_get_a_table_of_their_own(
     assert "Each training seed" not in capsys.readouterr().out
 
 
+def test_a_dataset_that_the_model_cannot_read_is_refused(
+    records_file: Path, tmp_path: Path, world_model_path: Path
+) -> None:
+    record_stranger(tmp_path / "stranger")
+    config = ReportConfig(
+        records=str(records_file),
+        output_dir=tmp_path / "report",
+        world_model_path=str(world_model_path),
+        dataset=ReportDatasetConfig("test/recorded", str(tmp_path / "stranger")),
+    )
+    with pytest.raises(ValueError, match=r"test/recorded has no observation\.image; it has"):
+        report(config)
+    assert not (tmp_path / "report").exists()
+
+
 def test_inputs_that_are_not_there_are_named(records_file: Path, tmp_path: Path) -> None:
     def build(**flags: str) -> None:
         report(ReportConfig(records=str(records_file), output_dir=tmp_path / "report", **flags))
@@ -168,6 +224,6 @@ def test_inputs_that_are_not_there_are_named(records_file: Path, tmp_path: Path)
         build(videos=str(tmp_path))
     with pytest.raises(FileNotFoundError, match=r"train_log\.jsonl is missing: --train_logs"):
         build(train_logs=str(tmp_path))
-    with pytest.raises(ValueError, match="both --world_model_path and"):
+    with pytest.raises(ValueError, match=r"--world_model_path=.* needs --dataset\.repo_id"):
         build(world_model_path=str(tmp_path))
     assert not (tmp_path / "report").exists()

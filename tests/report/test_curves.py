@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from lerobot_wm.report.curves import curve_figures, read_logs
 
 
@@ -29,6 +31,24 @@ def test_one_run_needs_no_legend(tmp_path: Path) -> None:
     figures = curve_figures(logs)
     assert [figure.axes[0].get_title() for figure in figures] == ["kl", "loss"]
     assert not figures[0].legends
+
+
+def test_steps_that_were_trained_again_are_drawn_once(tmp_path: Path) -> None:
+    run = write_log(tmp_path / "wm_rssm")
+    entries = [
+        {"step": step, "loss": loss} for step, loss in ((1, 5), (2, 4), (3, 3), (2, 6), (3, 7), (4, 8))
+    ]
+    (run / "train_log.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    assert read_logs([run])["wm_rssm"] == {"loss": [(1, 5), (2, 6), (3, 7), (4, 8)]}
+
+
+def test_runs_may_be_given_by_absolute_and_relative_paths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_log(tmp_path / "a", loss=1)
+    write_log(tmp_path / "b", loss=2)
+    monkeypatch.chdir(tmp_path)
+    assert list(read_logs([tmp_path / "a", Path("b")])) == ["a", "b"]
 
 
 def test_no_runs_have_no_curves() -> None:

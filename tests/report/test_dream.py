@@ -1,5 +1,6 @@
 """Dreams of episodes with two cameras of different sizes, by untrained world models made lively, and as a command."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -11,10 +12,13 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, REWARD, TASK
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, REWARD, SUCCESS, TASK
+from lerobot_wm.pipeline.dream import CheckpointConfig, DreamConfig, dream_of
+from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
@@ -23,7 +27,9 @@ from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.dream import OWN_ACTIONS, TRUE_ACTIONS, ZERO_ACTIONS, Dreams, dream
+from lerobot_wm.report.dream_clips import dream_clips
 from lerobot_wm.report.dream_figures import STEPS_SHOWN, strip_figure, video_frames
+from lerobot_wm.report.episodes import reward_key
 from lerobot_wm.report.open_loop import load_world_model
 from lerobot_wm.world_model.config import RSSMConfig
 from tests.report.quality_model import lively_world_model
@@ -31,6 +37,7 @@ from tests.report.quality_model import lively_world_model
 Command = Callable[..., None]
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 SIZES = {FRONT: (48, 80), WRIST: (64, 64)}
+AXES = ["height", "width", "channels"]
 LENGTHS = (9, 23, 3)
 CONTEXT = 4
 TASKS = ["lift it", "drop it"]
@@ -39,21 +46,23 @@ TASKS = ["lift it", "drop it"]
 def record(root: Path, cameras: dict[str, tuple[int, int]], action_dim: int = 3) -> Path:
     """Episodes of random images, actions and rewards; the task of each is another."""
     features = {
-        **{key: {"dtype": "image", "shape": (*size, 3), "names": None} for key, size in cameras.items()},
+        **{key: {"dtype": "image", "shape": (*size, 3), "names": AXES} for key, size in cameras.items()},
         OBS_STATE: {"dtype": "float32", "shape": (2,), "names": None},
         ACTION: {"dtype": "float32", "shape": (action_dim,), "names": None},
         REWARD: {"dtype": "float32", "shape": (1,), "names": None},
+        SUCCESS: {"dtype": "bool", "shape": (1,), "names": None},
     }
     dataset = LeRobotDataset.create("test/dream", 30, features, root=root, use_videos=False)
     rng = np.random.default_rng(0)
     for episode, length in enumerate(LENGTHS):
-        for _ in range(length):
+        for t in range(length):
             frame: dict[str, Any] = {
                 key: rng.integers(0, 256, (*size, 3), np.uint8) for key, size in cameras.items()
             }
             frame[OBS_STATE] = rng.normal(size=2).astype(np.float32)
             frame[ACTION] = rng.uniform(-1, 1, action_dim).astype(np.float32)
             frame[REWARD] = rng.uniform(size=1).astype(np.float32)
+            frame[SUCCESS] = np.array([t % 3 == 2])
             dataset.add_frame(frame | {TASK: TASKS[episode % 2]})
         dataset.save_episode()
     dataset.finalize()
@@ -82,7 +91,7 @@ def make_checkpoint(path: Path, policy_type: str, **settings: Any) -> Path:
     rssm = replace(rssm, predict_reward=settings.pop("predict_reward", True))
     policy: WMRSSMPolicy | LatentPolicy
     if policy_type == "wm_rssm":
-        policy = WMRSSMPolicy(WMRSSMConfig(rssm=rssm, input_features=inputs, **common))
+        policy = WMRSSMPolicy(WMRSSMConfig(rssm=rssm, input_features=inputs, **common, **settings))
     else:
         config_class = {"wm_bc": WMBCConfig, "wm_iql": WMIQLConfig}[policy_type]
         policy_class = {"wm_bc": WMBCPolicy, "wm_iql": WMIQLPolicy}[policy_type]
@@ -211,11 +220,44 @@ def test_strip_shows_steps_and_reward(dreams: Dreams) -> None:
         np.testing.assert_array_equal(curves[name].get_ydata(), told.reward[1:])
 
 
+def test_the_true_reward_is_of_the_column_that_the_model_learned(root: Path, tmp_path: Path) -> None:
+    path = make_checkpoint(tmp_path / "wm", "wm_rssm", reward_key=SUCCESS)
+    config = DreamConfig(
+        CheckpointConfig(str(path)), SourceConfig("test/dream", str(root)), 1, CONTEXT, output_dir=tmp_path
+    )
+    dreams = dream_of(config)
+    assert dreams.reward.tolist() == [float(t % 3 == 2) for t in range(LENGTHS[1])]
+    [curve] = [line for line in strip_figure(dreams).axes[-1].lines if "truth" in line.get_label()]
+    assert curve.get_label() == "truth (next.success)"
+
+
+def test_a_policy_knows_the_reward_of_its_world_model(tmp_path: Path) -> None:
+    path = make_checkpoint(tmp_path, "wm_bc")
+    settings = json.loads((path / "config.json").read_text())
+    settings["world_model"]["reward_key"] = SUCCESS
+    (path / "config.json").write_text(json.dumps(settings))
+    assert reward_key(load_world_model(str(path))) == SUCCESS
+
+
 def test_without_a_reward_head_there_is_no_curve(root: Path, tmp_path: Path) -> None:
     path = make_checkpoint(tmp_path, "wm_rssm", predict_reward=False)
     dreams = dream(load_world_model(str(path)), episode_of(root, 0), CONTEXT)
     assert list(dreams.dreams) == [TRUE_ACTIONS, ZERO_ACTIONS]
     assert len(strip_figure(dreams).axes) == 3 * (LENGTHS[0] - CONTEXT + 1)
+
+
+def test_clips_are_of_tasks_that_the_policy_knows(
+    root: Path, checkpoints: dict[str, Path], tmp_path: Path
+) -> None:
+    meta = LeRobotDatasetMetadata("test/dream", root=root)
+    clips = dream_clips(load_world_model(str(checkpoints["wm_bc"])), meta, root)
+    assert [(clip.task, clip.episode, clip.n_imagined) for clip in clips] == [
+        ("lift it", 0, LENGTHS[0] - 5),
+        ("drop it", 1, LENGTHS[1] - 5),
+    ], "the last episode of each task that is longer than what is seen"
+    assert clips[0].kinds == [TRUE_ACTIONS, ZERO_ACTIONS, OWN_ACTIONS]
+    stranger = make_checkpoint(tmp_path, "wm_bc", tasks=["drop it", "iron it"])
+    assert [clip.task for clip in dream_clips(load_world_model(str(stranger)), meta, root)] == ["drop it"]
 
 
 def test_video_frames_show_truth_and_dreams_side_by_side(dreams: Dreams) -> None:

@@ -1,15 +1,14 @@
 """A frozen image backbone that stands where a world model stands: its latent is the images' pooled features."""
 
 import difflib
-from dataclasses import dataclass
-from typing import Self
 
 import torch
 import torchvision
 from torch import Tensor, nn
 from torchvision.transforms.v2 import functional as vision
 
-from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import RGB_CHANNELS, BackboneConfig
+from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import RGB_CHANNELS
+from lerobot_wm.world_model.interface import LatentModel, PlainState
 
 TIMM_PREFIX = "timm/"
 # Mean and standard deviation of ImageNet's pixels, which published weights expect (torchvision, timm, R3M).
@@ -17,39 +16,32 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
-@dataclass(frozen=True)
-class BackboneState:
-    """The features of frames, `latent` (B, T, F) or (B, F): each depends on its own image alone."""
-
-    latent: Tensor
-
-    def last(self) -> Self:
-        """The state after the last of T frames, (B, F)."""
-        return type(self)(self.latent[:, -1])
-
-
-class FrozenBackbone(nn.Module):
+class FrozenBackbone(LatentModel):
     """A torchvision or timm model without its classifier, on images with ImageNet's normalisation.
 
-    It has the part of `WorldModel`'s interface that encoding and acting need (`FrozenEncoder`); actions,
-    proprioception and earlier states are accepted there and not used.
+    Its latent is the features of a frame, which depend on its own image alone.
+
+    Args:
+        name: A classification model of torchvision, or `timm/NAME` for one of timm.
+        image_size: Height and width that images are resized to.
+        n_cameras: Number of cameras, each encoded by itself.
 
     Raises:
-        ValueError: There is no such model, or it takes no images of `config.image_size`.
+        ValueError: There is no such model, or it takes no images of this size.
         ImportError: timm is asked for and not installed.
     """
 
-    def __init__(self, config: BackboneConfig) -> None:
+    def __init__(self, name: str, image_size: int, n_cameras: int = 1) -> None:
         super().__init__()
-        self.config = config
-        self.model = make_model(config.name)
+        self.name, self.image_size, self.n_cameras = name, image_size, n_cameras
+        self.model = make_model(name)
         self.requires_grad_(False).eval()
-        config.latent_dim = self._feature_dim()
+        self.latent_dim = self._feature_dim()  # of all cameras together
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
         """Pooled features of K cameras' images (B, T, 3·K, H, W) in [0, 1], camera after camera: (B, T, F)."""
-        size = [self.config.image_size] * 2
-        each = images.unflatten(2, (self.config.n_cameras, RGB_CHANNELS))  # (B, T, K, 3, H, W)
+        size = [self.image_size] * 2
+        each = images.unflatten(2, (self.n_cameras, RGB_CHANNELS))  # (B, T, K, 3, H, W)
         flat = vision.normalize(
             vision.resize(each.flatten(0, 2), size, antialias=True), list(IMAGENET_MEAN), list(IMAGENET_STD)
         )  # (B·T·K, 3, S, S)
@@ -59,27 +51,25 @@ class FrozenBackbone(nn.Module):
         self,
         images: Tensor,
         prev_actions: Tensor,
-        state: BackboneState | None = None,
+        state: PlainState | None = None,
         proprio: Tensor | None = None,
-        *,
-        sample: bool = False,
-    ) -> BackboneState:
-        """The features of images (B, T, 3·K, H, W) in [0, 1]; see `WorldModel.observe`."""
-        return BackboneState(self.embed(images))
+    ) -> PlainState:
+        """The features of images (B, T, 3·K, H, W) in [0, 1], (B, T, F); see `LatentModel.observe`."""
+        return PlainState(self.embed(images))
 
-    def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> BackboneState:
-        """The features themselves, (B, T, F); see `WorldModel.filter_embeds`."""
-        return BackboneState(embeds)
+    def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> PlainState:
+        """The features themselves, (B, T, F); see `LatentModel.filter_embeds`."""
+        return PlainState(embeds)
 
     @torch.no_grad()
     def _feature_dim(self) -> int:
         """F, found by trying: no table of models knows which image sizes they take."""
-        size = self.config.image_size
+        size = self.image_size
         try:
-            features = self.embed(torch.zeros(1, 1, RGB_CHANNELS * self.config.n_cameras, size, size))
+            features = self.embed(torch.zeros(1, 1, RGB_CHANNELS * self.n_cameras, size, size))
         except (AssertionError, RuntimeError) as error:
             raise ValueError(
-                f"{self.config.name} takes no images of {size}x{size} ({error}): set --policy.backbone_image_size, "
+                f"{self.name} takes no images of {size}x{size} ({error}): set --policy.backbone_image_size, "
                 "224 for most models with fixed positions."
             ) from error
         return features.shape[-1]

@@ -1,36 +1,18 @@
 """Configuration of a frozen image backbone as a LeRobot policy type."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NoReturn
 
-from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.configs import PreTrainedConfig
 
-from lerobot_wm.policies.cameras import ImagePolicyConfig
-from lerobot_wm.policies.features import IDENTITY_NORMALIZATION
+from lerobot_wm.policies.world_model_config import WorldModelConfig
 
 RGB_CHANNELS = 3
 
 
-@dataclass
-class BackboneConfig:
-    """What a backbone's weights are to be loaded into; part of every checkpoint that holds one.
-
-    Args:
-        name: A classification model of torchvision, or `timm/NAME` for one of timm.
-        image_size: Height and width that images are resized to.
-        n_cameras: Number of cameras, each encoded by itself.
-        latent_dim: Number of pooled features of all cameras together; filled when it is built.
-    """
-
-    name: str
-    image_size: int
-    n_cameras: int = 1
-    latent_dim: int = 0
-
-
 @PreTrainedConfig.register_subclass("frozen_backbone")
 @dataclass
-class FrozenBackboneConfig(ImagePolicyConfig):
+class FrozenBackboneConfig(WorldModelConfig):
     """An image backbone in place of the world model: the control that tells what pretraining on the robot adds.
 
     It is not trained: `lerobot-wm init` writes its checkpoint, which `lerobot-wm encode` and
@@ -41,28 +23,17 @@ class FrozenBackboneConfig(ImagePolicyConfig):
         weights_path: A local file with its weights, safetensors or a torch state dict (torchvision's, R3M's);
             None leaves it at its random initialisation.
         backbone_image_size: Height and width that images are resized to; None takes the first camera's size.
+        latent_dim: Number of pooled features of all cameras together; filled when the policy is made.
     """
 
     backbone: str = "resnet18"
     weights_path: str | None = None
     backbone_image_size: int | None = None
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict(IDENTITY_NORMALIZATION)
-    )
+    latent_dim: int = 0
 
     @property
-    def observation_delta_indices(self) -> None:
-        """Single frames."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        """Single frames."""
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """Single frames."""
+    def action_dim(self) -> None:
+        """None: features depend on one image."""
         return None
 
     def validate_features(self) -> None:
@@ -71,7 +42,7 @@ class FrozenBackboneConfig(ImagePolicyConfig):
         Raises:
             ValueError: The cameras cannot be used, or their images are not RGB.
         """
-        self.choose_cameras()
+        super().validate_features()
         for key in self.cameras:
             channels = self.input_features[key].shape[0]
             if channels != RGB_CHANNELS:
@@ -89,7 +60,3 @@ class FrozenBackboneConfig(ImagePolicyConfig):
             "A frozen backbone is not trained. Write its checkpoint with "
             "`lerobot-wm init --policy.type=frozen_backbone --dataset.repo_id=... --output_dir=...`."
         )
-
-    def get_scheduler_preset(self) -> None:
-        """None: nothing is trained."""
-        return None

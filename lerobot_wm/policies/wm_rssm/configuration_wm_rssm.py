@@ -1,21 +1,22 @@
 """Configuration of the world model as a LeRobot policy type."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
-from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.configs import PreTrainedConfig
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.conv import IMAGE_SIZE
-from lerobot_wm.policies.cameras import ImagePolicyConfig
-from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, default_dtype, feature_dim
+from lerobot_wm.policies.features import default_dtype, feature_dim
 from lerobot_wm.policies.optim import FusedAdamConfig
 from lerobot_wm.policies.rewards import RewardConfig
+from lerobot_wm.policies.world_model_config import WorldModelConfig
 from lerobot_wm.world_model.config import RSSMConfig
 
 
 @PreTrainedConfig.register_subclass("wm_rssm")
 @dataclass
-class WMRSSMConfig(ImagePolicyConfig, RewardConfig):
+class WMRSSMConfig(WorldModelConfig, RewardConfig):
     """The paper's RSSM, trained on windows of images and actions (section 3.1.1).
 
     Several cameras are one image of more channels to it. Its error is summed over them all, so that each camera adds
@@ -29,14 +30,14 @@ class WMRSSMConfig(ImagePolicyConfig, RewardConfig):
         dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in.
     """
 
+    predicts_images: ClassVar[bool] = True
+    scales_latents: ClassVar[bool] = False
+
     rssm: RSSMConfig = field(default_factory=RSSMConfig)
     window_length: int = 25
     lr: float = 6e-4
     grad_clip_norm: float = 100.0
     dtype: str | None = None
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict(IDENTITY_NORMALIZATION)
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,6 +71,11 @@ class WMRSSMConfig(ImagePolicyConfig, RewardConfig):
         return list(range(self.window_length))
 
     @property
+    def latent_dim(self) -> int:
+        """Size of s_t = [d_t, z_t]."""
+        return self.rssm.latent_dim
+
+    @property
     def features_read(self) -> list[str]:
         """Cameras, and proprioception where it is modelled."""
         return [*self.cameras, *([OBS_STATE] if self.rssm.use_proprio else [])]
@@ -85,7 +91,7 @@ class WMRSSMConfig(ImagePolicyConfig, RewardConfig):
         Raises:
             ValueError: The cameras cannot be used, there is no action, or sizes are unlike the checkpoint's.
         """
-        self.choose_cameras()
+        super().validate_features()
         sizes = {
             "action_dim": feature_dim(self.output_features, ACTION, "The dataset"),
             "image_channels": self.image_shape[0],
@@ -104,7 +110,3 @@ class WMRSSMConfig(ImagePolicyConfig, RewardConfig):
     def get_optimizer_preset(self) -> FusedAdamConfig:
         """Adam 6e-4 with gradients clipped at 100, as in Dreamer V1 and TorchRL."""
         return FusedAdamConfig(lr=self.lr, grad_clip_norm=self.grad_clip_norm)
-
-    def get_scheduler_preset(self) -> None:
-        """A constant learning rate."""
-        return None

@@ -1,6 +1,6 @@
 """The world model as a LeRobot policy: `forward` is its training loss on windows."""
 
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -9,21 +9,19 @@ from torch import Tensor
 from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
 from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.features import stat
-from lerobot_wm.policies.pretrained import StrictPolicy
 from lerobot_wm.policies.rewards import FrameLabel, reward_columns
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+from lerobot_wm.policies.world_model_policy import WorldModelPolicy
 from lerobot_wm.world_model.model import WorldModel
 
 
-class WMRSSMPolicy(StrictPolicy):
-    """An RSSM pretrained on the images and actions of all tasks.
-
-    It has no action head: `wm_bc` and `wm_iql` act on its latents.
-    """
+class WMRSSMPolicy(WorldModelPolicy):
+    """An RSSM pretrained on the images and actions of all tasks."""
 
     config_class = WMRSSMConfig
     name = "wm_rssm"
     config: WMRSSMConfig
+    world_model: WorldModel
 
     def __init__(
         self,
@@ -31,9 +29,8 @@ class WMRSSMPolicy(StrictPolicy):
         dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
-        super().__init__(config)
         made_new = config.rssm.action_dim == 0
-        config.validate_features()
+        super().__init__(config, dataset_stats, dataset_meta)
         self._learns_reward = config.rssm.predict_reward
         if dataset_meta is not None:  # to be trained
             config.fit_windows(min(dataset_meta.episodes["length"]))
@@ -62,10 +59,6 @@ class WMRSSMPolicy(StrictPolicy):
             )
         return key in known
 
-    def get_optim_params(self) -> dict:
-        """Every parameter: the whole world model is trained."""
-        return list(self.parameters())  # type: ignore[return-value]  # LeRobot's annotation is narrower than its use
-
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """The world-model loss on a batch of windows.
 
@@ -86,21 +79,3 @@ class WMRSSMPolicy(StrictPolicy):
         )
         values = torch.stack(list(parts.values())).tolist()  # one transfer from the device for all of them
         return loss, dict(zip(parts, values, strict=True))
-
-    def reset(self) -> None:
-        """Nothing to reset: no recurrent state is kept between calls."""
-
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> NoReturn:
-        """Refuse: a world model has no policy.
-
-        Raises:
-            NotImplementedError: Always; says which policy types act.
-        """
-        raise NotImplementedError(
-            "wm_rssm is a world model and chooses no actions. Train a policy on its latents: "
-            "lerobot-wm train --policy.type=wm_bc (or wm_iql) --policy.world_model_path=<this checkpoint>."
-        )
-
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> NoReturn:
-        """Refuse, as `select_action` does."""
-        self.select_action(batch)

@@ -1,0 +1,69 @@
+"""Is a dataset on this machine whole? Asked before any work.
+
+LeRobot would ask the Hub for what is missing, and find out late about the rest. Metadata is read, the columns that
+number the frames, and the headers of videos; no image is decoded.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from datasets.exceptions import DatasetGenerationError
+from huggingface_hub.utils import validate_repo_id
+from lerobot.utils.constants import HF_LEROBOT_HOME
+
+from lerobot_wm.data.check_episodes import check_tasks, read_episodes
+from lerobot_wm.data.check_frames import check_contents, check_frames
+from lerobot_wm.data.check_info import read_info
+from lerobot_wm.data.check_stats import check_stats
+from lerobot_wm.data.check_videos import check_video_file, check_video_times
+
+
+def check_dataset(repo_id: str, root: str | Path | None = None) -> None:
+    """Refuse a dataset on this machine that is not whole, or whose parts do not belong together.
+
+    Nothing is looked up elsewhere. A folder without any part of a dataset passes: LeRobot will download it there.
+
+    Args:
+        repo_id: The dataset's name.
+        root: Its folder; None looks where LeRobot does.
+
+    Raises:
+        DatasetError: Names the file, what is wrong with it, and how to mend it.
+        HFValidationError: The name is none of a repository and no folder is given.
+    """
+    if root is None:
+        validate_repo_id(repo_id)
+    folder = _folder(repo_id, root)
+    if not any((folder / part).exists() for part in ("meta", "data", "videos")):
+        return
+    info = read_info(folder)
+    check_stats(info)
+    check_tasks(info)
+    episodes = read_episodes(info)
+    # Of a dataset of the Hub some episodes may be here; LeRobot downloads the others when they are asked for.
+    partial = (folder / ".cache" / "huggingface").is_dir()
+    check_frames(info, episodes, partial)
+    for camera in info.video_keys:
+        check_video_times(info, camera, episodes)
+        for path, seconds in info.videos(camera, episodes).items():
+            if path.exists() or not partial:
+                check_video_file(info, camera, path, seconds)
+
+
+@contextmanager
+def damage_named(repo_id: str, root: str | Path | None) -> Iterator[None]:
+    """Name the file where LeRobot finds a table damaged that `check_dataset` passed: it reads no values.
+
+    Raises:
+        DatasetError: Names the file.
+    """
+    try:
+        yield
+    except DatasetGenerationError:
+        check_contents(_folder(repo_id, root))
+        raise
+
+
+def _folder(repo_id: str, root: str | Path | None) -> Path:
+    return HF_LEROBOT_HOME / repo_id if root is None else Path(root)

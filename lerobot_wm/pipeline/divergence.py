@@ -1,0 +1,76 @@
+"""Training stops at the first loss or gradient that is not finite, before it reaches the weights."""
+
+from collections.abc import Callable, Iterator
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_wm.data.loader import RamLoader
+
+
+class DivergenceError(RuntimeError):
+    """The loss or its gradient is NaN or infinite; its text is one line: which part of the loss, on which episodes."""
+
+
+class LossWatch:
+    """Looks at each step's loss and gradient, and remembers the loss's parts to name the one that is not finite."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, Any] = {}
+        self._model = nn.Module()
+
+    def attach(self, model: nn.Module) -> None:
+        """Follow a LeRobot policy, prepared for training; its `forward` returns the loss and its parts by name."""
+        self._model = model
+        model.forward = self._noting(model.forward)  # LeRobot calls it by name, past the hooks of modules
+
+    def _noting(self, forward: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(forward)
+        def noted(*args: Any, **kwargs: Any) -> Any:
+            loss, parts = forward(*args, **kwargs)
+            self._parts = parts or {}
+            return loss, parts
+
+        return noted
+
+    def check(self, loss: Tensor, served: RamLoader, last_checkpoint: Path) -> None:
+        """Look at a step between its backward pass and the optimizer's.
+
+        Processes that train together find a gradient that is not finite at the same step: they have averaged it.
+
+        Args:
+            loss: The scalar.
+            served: The batch is the last it served.
+            last_checkpoint: Where to go on from, if it is there.
+
+        Raises:
+            DivergenceError: The loss or a gradient is not finite.
+        """
+        gradients = [parameter.grad for parameter in self._model.parameters() if parameter.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients)
+        if bool((loss.detach() + norm).isfinite()):
+            return
+        parts = ", ".join(self._broken_parts()) or f"the gradient of {next(self._broken_gradients(), 'all')}"
+        episodes = ", ".join(map(str, served.episodes))
+        saved = (
+            f"the last checkpoint, {last_checkpoint}, is whole"
+            if last_checkpoint.exists()
+            else "none is saved yet"
+        )
+        raise DivergenceError(
+            f"training diverged: {parts} is NaN or Inf on a batch of the episodes {episodes}. It did "
+            f"not reach the weights; {saved}. Train with a lower --policy.lr, or in --policy.dtype=float32."
+        )
+
+    def _broken_parts(self) -> Iterator[str]:
+        for name, value in self._parts.items():
+            if isinstance(value, float) and not -float("inf") < value < float("inf"):
+                yield f"the loss's part '{name}'"
+
+    def _broken_gradients(self) -> Iterator[str]:
+        for name, parameter in self._model.named_parameters():
+            if parameter.grad is not None and not parameter.grad.isfinite().all():
+                yield name

@@ -1,0 +1,44 @@
+"""A checkpoint's processors must not name code to run."""
+
+import json
+from pathlib import Path
+
+from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import EntryNotFoundError
+from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+
+
+def check_processors(checkpoint: str | Path, revision: str | None) -> None:
+    """Refuse a checkpoint whose processing steps are not LeRobot's registered ones.
+
+    LeRobot imports and calls whatever Python object the files name by its path, such as one that starts programs.
+
+    Args:
+        checkpoint: Folder or Hub id.
+        revision: Of the Hub; None takes its main branch.
+
+    Raises:
+        ValueError: A file is no list of registered steps.
+    """
+    for name in (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME):
+        path = Path(checkpoint) / f"{name}.json"
+        if not Path(checkpoint).is_dir():
+            try:
+                path = Path(hf_hub_download(str(checkpoint), path.name, revision=revision))
+            except EntryNotFoundError:
+                continue
+        if path.is_file():
+            _check(path)
+
+
+def _check(path: Path) -> None:
+    try:
+        steps = json.loads(path.read_text(encoding="utf-8"))["steps"]
+        registered = all(isinstance(step["registry_name"], str) for step in steps)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        registered = False
+    if not registered:
+        raise ValueError(
+            f"{path} does not name every processing step by its registry_name: it is damaged, or would have a Python "
+            "object of its choice called. Use a checkpoint you trust, written by LeRobot."
+        )

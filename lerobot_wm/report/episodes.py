@@ -1,0 +1,100 @@
+"""Episodes of an image dataset as a world model is shown them: what it reads, and reading it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wm.constants import ACTION
+from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+
+
+def shapes_read(policy: WMRSSMPolicy | LatentPolicy) -> dict[str, tuple[int, ...]]:
+    """Keys that the model and a policy on it read from a dataset, with their shapes in training (cameras: C, H, W)."""
+    config = policy.config
+    shapes = {key: tuple(config.input_features[key].shape) for key in config.features_read}
+    return shapes | {ACTION: tuple(config.output_features[ACTION].shape)}
+
+
+def reward_key(policy: WMRSSMPolicy | LatentPolicy) -> str:
+    """The column that the world model's reward head learned; wm_iql's own `reward_key` may be another."""
+    config = policy.config if isinstance(policy, WMRSSMPolicy) else policy.config.world_model
+    assert isinstance(config, WMRSSMConfig)  # the readers of this module dream with it
+    return config.reward_key
+
+
+def check_features(policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata) -> None:
+    """Refuse a dataset without what the model and a policy on it read; images of any size are resized.
+
+    Raises:
+        ValueError: It lacks a feature, or has it in another size.
+    """
+    shapes = shapes_read(policy)
+    missing = [key for key in shapes if key not in meta.features]
+    if missing:
+        raise ValueError(
+            f"{meta.repo_id} has no {', '.join(missing)}; it has {', '.join(sorted(meta.features))}. Give the "
+            "--dataset.repo_id of an image dataset like the one the world model was trained on."
+        )
+    for key in shapes.keys() - policy.config.cameras:
+        found = tuple(meta.features[key]["shape"])
+        if found != shapes[key]:
+            raise ValueError(
+                f"'{key}' of {meta.repo_id} is {found}, the checkpoint was trained on {shapes[key]}: "
+                "use the kind of dataset it was trained on."
+            )
+
+
+def episodes_by_task(meta: LeRobotDatasetMetadata, min_length: int = 1) -> dict[str, list[int]]:
+    """Indices of each task's episodes of at least `min_length` frames; tasks in the order they occur."""
+    found: dict[str, list[int]] = {}
+    lengths, tasks = meta.episodes["length"][:], meta.episodes["tasks"][:]
+    for index, (length, of_episode) in enumerate(zip(lengths, tasks, strict=True)):
+        if length >= min_length:
+            found.setdefault(of_episode[0], []).append(index)
+    return found
+
+
+def read_episodes(
+    policy: WMRSSMPolicy | LatentPolicy,
+    meta: LeRobotDatasetMetadata,
+    root: str | Path | None,
+    episodes: list[int],
+    max_frames: int | None = None,
+    revision: str | None = None,
+) -> Iterator[dict[str, Any]]:
+    """Read episodes one after another; no other's images are decoded.
+
+    Args:
+        policy: The model, or a policy on it.
+        meta: The dataset's.
+        root: Its folder; None for LeRobot's own place.
+        episodes: Which, in ascending order.
+        max_frames: How many frames of each, from its first on; None reads it whole.
+        revision: Of a dataset on the Hub.
+
+    Yields:
+        What the policy reads of T frames: each camera (T, C, H, W) in [0, 1], `action` (T, A) and the others of
+        `shapes_read` (T, ·); the model's reward (T,) where the dataset has that column; `task`.
+    """
+    keys = [*shapes_read(policy), *({reward_key(policy)} & meta.features.keys())]
+    all_lengths = meta.episodes["length"][:]
+    lengths = [all_lengths[episode] for episode in episodes]
+    n_frames = min(max(lengths), max_frames or max(lengths))
+    times = [step / meta.fps for step in range(n_frames)]
+    dataset = LeRobotDataset(
+        meta.repo_id,
+        root=root,
+        revision=revision,
+        episodes=episodes,
+        delta_timestamps=dict.fromkeys(keys, times),
+    )
+    start = 0  # among the frames of these episodes
+    for length in lengths:
+        window = dataset[start]  # beyond its end an episode's last frame is repeated
+        yield window | {key: window[key][:length] for key in keys}
+        start += length

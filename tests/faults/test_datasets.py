@@ -1,0 +1,115 @@
+"""Broken datasets are refused before any work, by one line that names the file; the network is never asked."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wm.data.cache import camera_frames
+from lerobot_wm.data.check import check_dataset
+from lerobot_wm.data.errors import DatasetError
+from lerobot_wm.pipeline.merge import merge_datasets
+from lerobot_wm.pipeline.source import SourceConfig
+from tests.documents import ROOT
+from tests.faults.breakage import DATA, FAULTS, VIDEO, damage, remove
+from tests.faults.conftest import WIDE
+
+
+def test_a_whole_dataset_passes(whole_dataset: Path) -> None:
+    check_dataset("test/faults", whole_dataset)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_broken_dataset_is_refused(fault: str, dataset: Path) -> None:
+    break_it, begins = FAULTS[fault]
+    break_it(dataset)
+    with pytest.raises(DatasetError) as refusal:
+        check_dataset("test/faults", dataset)
+    message = str(refusal.value)
+    assert message.startswith(f"{dataset}/{begins}")
+    assert "\n" not in message
+    assert len(message) < len(str(dataset)) + 500
+
+
+def test_damage_inside_the_data_is_found_when_it_is_opened(dataset: Path) -> None:
+    damage(dataset, DATA.format(2), "action")
+    check_dataset("test/faults", dataset)  # the columns that number frames are whole
+    with pytest.raises(DatasetError, match=r"file-002.parquet cannot be read"):
+        SourceConfig("test/faults", str(dataset)).open()
+
+
+def test_damage_inside_a_video_is_found_when_it_is_decoded(dataset: Path) -> None:
+    # As after a bad copy: the header promises frames that are not there.
+    path = dataset / VIDEO.format("wide", 1)
+    content = path.read_bytes()
+    start = content.index(b"mdat") + 4
+    size = int.from_bytes(content[start - 8 : start - 4]) - 8
+    path.write_bytes(content[:start] + bytes(size) + content[start + size :])
+    check_dataset("test/faults", dataset)
+    with pytest.raises(
+        DatasetError, match=r"wide/chunk-000/file-001.mp4: the images of .*wide in episode 1 cannot"
+    ):
+        camera_frames(LeRobotDataset("test/faults", root=dataset), WIDE)
+
+
+def test_a_dataset_that_is_not_here_is_left_to_lerobot(tmp_path: Path) -> None:
+    check_dataset("test/faults", tmp_path / "nothing")
+    (tmp_path / "empty").mkdir()
+    check_dataset("test/faults", tmp_path / "empty")
+
+
+def test_a_download_of_some_episodes_passes(dataset: Path) -> None:
+    (dataset / ".cache" / "huggingface").mkdir(parents=True)
+    remove(dataset, DATA.format(1))
+    remove(dataset, "videos")
+    check_dataset("test/faults", dataset)
+
+
+def test_a_broken_dataset_is_not_merged(whole_dataset: Path, dataset: Path, tmp_path: Path) -> None:
+    remove(dataset, DATA.format(1))
+    with pytest.raises(DatasetError, match="file-001"):
+        merge_datasets([whole_dataset, dataset], "test/merged", tmp_path / "merged")
+    assert not (tmp_path / "merged").exists()
+
+
+def test_commands_end_in_one_line_and_ask_no_network(whole_dataset: Path, tmp_path: Path) -> None:
+    lines = []
+    for number, (break_it, _) in enumerate(FAULTS.values()):
+        root = shutil.copytree(whole_dataset, tmp_path / str(number))
+        break_it(root)
+        flags = ["--dataset.repo_id=test/faults", f"--dataset.root={root}"]
+        training = ["--policy.type=wm_rssm", "--policy.push_to_hub=false", "--policy.device=cpu"]
+        lines.append(["train", *flags, *training, f"--output_dir={tmp_path / 'run'}"])
+        lines.append(
+            [
+                "relabel",
+                *flags,
+                "--reward=next.reward",
+                "--output_repo_id=a/b",
+                f"--output_root={tmp_path / 'out'}",
+            ]
+        )
+    environment = {name: value for name, value in os.environ.items() if name != "HF_HUB_OFFLINE"}
+    run = subprocess.run(
+        [sys.executable, "tests/faults/breakage.py"],
+        cwd=ROOT,
+        env=environment,
+        input="\n".join(map(json.dumps, lines)),
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=True,
+    )
+    results = [json.loads(line[7:]) for line in run.stdout.splitlines() if line.startswith("RESULT ")]
+    assert len(results) == len(lines)
+    for (message, connections), (name, *_) in zip(results, lines, strict=True):
+        assert connections == []
+        assert message.startswith(f"lerobot-wm {name}: {tmp_path}"), message
+        assert "\n" not in message
+    assert "Traceback" not in run.stderr
+    assert not (tmp_path / "run").exists()
