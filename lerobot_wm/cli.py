@@ -13,6 +13,7 @@ from lerobot.configs.parser import (
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_wm.pipeline.errors import exit_with_one_line
+from lerobot_wm.pipeline.remarks import drop_remarks
 
 # name -> (module with a main() that reads sys.argv, what it does)
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -65,6 +66,7 @@ def main() -> None:
         return
     if name not in COMMANDS:
         sys.exit(f"lerobot-wm: no command '{name}'; expected one of {', '.join(COMMANDS)}.")
+    drop_remarks()
     try:
         arguments = load_plugins(sys.argv[2:])
     except PluginLoadError as error:

@@ -10,6 +10,7 @@ import torch
 from accelerate.state import AcceleratorState
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("WANDB_ERROR_REPORTING", "false")  # else wandb reports its own errors to its makers
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train

@@ -25,7 +25,7 @@ from lerobot_wm.hub.dataset_card import license_of, push_latents
 from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.pipeline.encode_episodes import episode_batches
 from lerobot_wm.pipeline.encode_parts import LatentParts
-from lerobot_wm.pipeline.quiet import drop_remarks, quiet
+from lerobot_wm.pipeline.quiet import quiet
 from lerobot_wm.pipeline.share import Share, refuse_difference
 from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
@@ -209,7 +209,6 @@ def _check_same(found: LatentRecord, expected: LatentRecord, root: Path) -> None
 
 def main() -> None:
     """Entry point of `lerobot-wm encode`."""
-    drop_remarks()
     cfg = draccus.parse(EncodeConfig)
     if cfg.push_to_hub:
         check_can_push(cfg.output_repo_id)

@@ -13,7 +13,6 @@ from multiprocessing import get_context
 
 import torch
 from lerobot.configs import parser
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 from rich.console import Console
 from tqdm import tqdm
@@ -21,7 +20,7 @@ from tqdm import tqdm
 from lerobot_wm.cores import usable_cores
 from lerobot_wm.pipeline.eval_config import EvaluateConfig
 from lerobot_wm.pipeline.processors import check_processors
-from lerobot_wm.pipeline.quiet import drop_remarks
+from lerobot_wm.pipeline.remarks import drop_remarks
 from lerobot_wm.pipeline.rollouts import TaskRunner, task_names
 from lerobot_wm.pipeline.wandb_log import log_evaluation, wandb_run
 from lerobot_wm.report.provenance import provenance
@@ -129,6 +128,4 @@ def _evaluate_from_command_line(cfg: EvaluateConfig) -> None:
 def main() -> None:
     """Entry point of `lerobot-wm eval`."""
     init_logging()
-    drop_remarks()
-    register_third_party_plugins()
     _evaluate_from_command_line()  # type: ignore[call-arg]

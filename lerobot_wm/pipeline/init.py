@@ -12,10 +12,8 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_wm.pipeline.quiet import drop_remarks
 from lerobot_wm.pipeline.source import SourceConfig
 
 
@@ -62,6 +60,4 @@ def initialise(cfg: InitConfig) -> Path:
 
 def main() -> None:
     """Entry point of `lerobot-wm init`."""
-    drop_remarks()
-    register_third_party_plugins()
     print(f"Untrained checkpoint: {initialise(draccus.parse(InitConfig))}")

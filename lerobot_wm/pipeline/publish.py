@@ -18,7 +18,6 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.hub.markdown import escaped
 from lerobot_wm.hub.model_card import IMAGINATION, TrainingData, model_card
-from lerobot_wm.pipeline.quiet import drop_remarks
 from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.report.imagination import animation, psnr_table
 from lerobot_wm.report.open_loop import load_world_model, open_loop
@@ -150,7 +149,6 @@ def _upload(files: dict[str, Path | bytes], repo_id: str, private: bool) -> str:
 
 def main() -> None:
     """Entry point of `lerobot-wm publish`."""
-    drop_remarks()
     cfg = draccus.parse(PublishConfig)
     try:
         check_can_push(cfg.repo_id)

@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from lerobot_wm.constants import REWARD
 from lerobot_wm.data.fingerprint import dataset_fingerprint
-from lerobot_wm.pipeline.quiet import drop_remarks
 from lerobot_wm.pipeline.source import SourceConfig
 
 RELABEL_RECORD = Path("meta", "relabel.json")
@@ -102,7 +101,6 @@ def _overwrite(file: Path, sources: dict[str, str]) -> None:
 
 def main() -> None:
     """Entry point of `lerobot-wm relabel`."""
-    drop_remarks()
     cfg = draccus.parse(RelabelConfig)
     dataset = relabel(cfg.dataset.open(), cfg.reward, cfg.output_repo_id, cfg.output_root)
     print(f"{dataset.num_frames} frames with the reward {cfg.reward} -> {cfg.output_root}")

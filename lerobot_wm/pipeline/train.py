@@ -15,7 +15,6 @@ from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.scripts.lerobot_train import train as lerobot_train
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.logging_utils import MetricsTracker
 from torch import Tensor
 
@@ -26,7 +25,6 @@ from lerobot_wm.hub.errors import check_can_push, check_dataset_version
 from lerobot_wm.pipeline.divergence import LossWatch
 from lerobot_wm.pipeline.encode import encode_to_cache
 from lerobot_wm.pipeline.processors import check_processors
-from lerobot_wm.pipeline.quiet import drop_remarks
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
@@ -208,6 +206,4 @@ def train(cfg: TrainPipelineConfig) -> None:
 
 def main() -> None:
     """Entry point of `lerobot-wm train`."""
-    drop_remarks()
-    register_third_party_plugins()
     train()

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import draccus
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.utils.import_utils import register_third_party_plugins
 from rich.console import Console
 
 from lerobot_wm.policies.latent_policy import LatentPolicy
@@ -129,6 +128,5 @@ def _paths(comma_separated: str | None) -> list[Path]:
 
 def main() -> None:
     """Entry point of `lerobot-wm report`."""
-    register_third_party_plugins()
     index = report(draccus.parse(ReportConfig))
     print(f"Report: {index}")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import draccus
 import torch
-from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_wm.policies.cameras import side_by_side
 from lerobot_wm.report.inline import PNG, SVG, figure_bytes
@@ -175,6 +174,5 @@ def main() -> None:
     """Entry point of `lerobot-wm quality`."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     logging.getLogger("lerobot").setLevel(logging.ERROR)  # it warns of its video decoder once per episode
-    register_third_party_plugins()
     path = quality(draccus.parse(QualityConfig))
     print(f"World-model quality: {path}")

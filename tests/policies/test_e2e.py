@@ -217,7 +217,7 @@ def test_one_known_task_needs_no_string() -> None:
 
 
 def test_other_image_size() -> None:
-    with pytest.raises(ValueError, match=r"\(3, 96, 96\).*\(3, 16, 20\).*16x20"):
+    with pytest.raises(ValueError, match=r"\(3, 96, 96\).*\(3, 16, 20\).*height of 16 and a width of 20"):
         make_policy("e2e_bc").select_action({**seen(1), CAMERA: torch.zeros(1, 3, 96, 96)})
 
 
