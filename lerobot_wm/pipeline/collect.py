@@ -62,6 +62,7 @@ def collect(config: CollectConfig) -> Path:
     records = [ShardRecord.load(folder / shard.name) for shard in shards]
     merged = folder / f"{TEMPORARY_PREFIX}merged"
     shutil.rmtree(merged, ignore_errors=True)
+    print(f"Merging {len(shards)} shards")
     with quiet():
         merge_datasets([folder / shard.name for shard in shards], config.repo_id, merged)
     seconds = time.monotonic() - start

@@ -6,6 +6,7 @@ from tempfile import TemporaryDirectory
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.io_utils import write_video
+from tqdm import tqdm
 
 from lerobot_wm.constants import TASK
 from lerobot_wm.policies.latent_policy import LatentPolicy
@@ -56,7 +57,7 @@ def dream_clips(
     episodes = read_episodes(policy, meta, root, chosen, MAX_FRAMES)
     return [
         _clip(dream(policy, episode, CONTEXT), episode[TASK], index, meta.fps)
-        for index, episode in zip(chosen, episodes, strict=True)
+        for index, episode in zip(tqdm(chosen, desc="Dreaming", unit="episode"), episodes, strict=True)
     ]
 
 

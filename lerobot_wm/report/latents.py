@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
+from tqdm import tqdm
 
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
 from lerobot_wm.policies.cameras import camera_images
@@ -64,7 +65,8 @@ def latent_map(
     episodes = sorted(index for of_task in by_task.values() for index in of_task[-per_task:])
     tasks = list(by_task)
     latents, task, time = [], [], []
-    for episode in read_episodes(policy, meta, root, episodes):
+    read = read_episodes(policy, meta, root, episodes)
+    for episode in tqdm(read, total=len(episodes), desc="Mapping", unit="episode"):
         batch = {key: value[None].to(policy.config.device) for key, value in episode.items() if key != TASK}
         proprio = batch[OBS_STATE] if world_model.config.use_proprio else None
         states = world_model.filter(camera_images(policy.config, batch), batch[ACTION], proprio)

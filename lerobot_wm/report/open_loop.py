@@ -10,6 +10,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from matplotlib.figure import Figure
 from torch import Tensor
+from tqdm import tqdm
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.policies.cameras import camera_images, side_by_side
@@ -74,7 +75,7 @@ def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | Non
         raise ValueError(f"{repo_id} has no episode of {WINDOW} frames, which open-loop prediction needs.")
     return [
         predict(policy, task, [dataset[i] for i in indices[-EPISODES_PER_TASK:]])
-        for task, indices in starts.items()
+        for task, indices in tqdm(starts.items(), desc="Imagining", unit="task")
     ]
 
 

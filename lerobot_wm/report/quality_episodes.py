@@ -7,6 +7,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
+from tqdm import trange
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, SUCCESS, VARIATION
 from lerobot_wm.data.cache import camera_frames
@@ -122,7 +123,7 @@ def filter_episodes(world_model: WorldModel, episodes: list[Episode]) -> list[Fi
     """Filter every episode from its first frame on; results are on the CPU."""
     device = world_model.action_scaling.offset.device
     results = []
-    for begin in range(0, len(episodes), _EPISODES_PER_BATCH):
+    for begin in trange(0, len(episodes), _EPISODES_PER_BATCH, desc="Filtering", unit="batch"):
         batch = episodes[begin : begin + _EPISODES_PER_BATCH]
         # The filter is causal: what pads the shorter episodes comes after their last frame.
         embeds = pad_sequence([_embed(world_model, episode, device) for episode in batch], batch_first=True)

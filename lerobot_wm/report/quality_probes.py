@@ -12,6 +12,7 @@ from sklearn.metrics import r2_score
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
+from tqdm import tqdm
 
 from lerobot_wm.report.quality_episodes import Episode, Filtered
 
@@ -160,7 +161,7 @@ def probe_positions(frames: Frames) -> list[dict]:
     positions' variance that is explained, summed over x, y and z; below 0 is worse than their mean.
     """
     rows = []
-    for task in dict.fromkeys(frames.tasks.tolist()):
+    for task in tqdm(dict.fromkeys(frames.tasks.tolist()), desc="Probing", unit="task"):
         of_task = np.flatnonzero(frames.tasks == task)
         parts = splits(frames, of_task)
         for target, columns in TARGETS.items():
