@@ -1,11 +1,14 @@
 """Untrained policies for the rows that time decisions and rollouts: speed does not depend on the weights."""
 
+from typing import Any
+
 from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_wm.constants import ACTION, ACTION_DIM, MT6, OBS_IMAGE, OBS_STATE, STATE_DIM
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.world_model.config import RSSMConfig
 
 
@@ -24,13 +27,13 @@ def output_features() -> dict[str, PolicyFeature]:
 
 def wm_bc(image_size: int) -> WMBCPolicy:
     """wm_bc with its world model for the six tasks; images of another size than 64x64 are scaled down by it."""
-    config = WMBCConfig(
-        device="cpu",
-        push_to_hub=False,
-        input_features=input_features(image_size),
-        output_features=output_features(),
-        image_key=OBS_IMAGE,
-        rssm=RSSMConfig(image_channels=3, action_dim=ACTION_DIM),
-        tasks=[task_description(task) for task in MT6],
-    )
+    common: dict[str, Any] = {
+        "device": "cpu",
+        "push_to_hub": False,
+        "input_features": input_features(image_size),
+        "output_features": output_features(),
+        "image_key": OBS_IMAGE,
+    }
+    world_model = WMRSSMConfig(rssm=RSSMConfig(image_channels=3, action_dim=ACTION_DIM), **common)
+    config = WMBCConfig(world_model=world_model, tasks=[task_description(task) for task in MT6], **common)
     return WMBCPolicy(config).eval()

@@ -21,12 +21,11 @@ from lerobot_wm.constants import (
     TASK_ID,
     VARIATION,
 )
-from lerobot_wm.data.schema import check_finite, metaworld_features
+from lerobot_wm.data.schema import COLLECTION_RECORD, check_finite, metaworld_features
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.envs.tasks import task_description, task_id
 from lerobot_wm.envs.variations import parse_variations, rand_vec
 from lerobot_wm.pipeline.collect import CollectConfig, collect
-from lerobot_wm.pipeline.collect_report import COLLECTION_RECORD
 from lerobot_wm.pipeline.collect_shards import Shard, ShardRecord, write_shard
 from lerobot_wm.pipeline.quiet import quiet
 

@@ -8,7 +8,7 @@ from lerobot.datasets.io_utils import load_episodes
 from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR
 
 from lerobot_wm.data.check_info import MEND, Info, one_line, read_file, shown
-from lerobot_wm.data.check_tables import check_columns, read_numbers, read_whole
+from lerobot_wm.data.check_tables import check_columns, first_difference, read_numbers, read_whole
 from lerobot_wm.data.errors import DatasetError
 
 
@@ -69,13 +69,10 @@ def read_episodes(info: Info) -> pd.DataFrame:
         "dataset_from_index": stops - lengths,
         "dataset_to_index": stops,
     }
-    for name, values in expected.items():
-        wrong = np.flatnonzero(episodes[name].to_numpy() != values)
-        if len(wrong):
-            row = wrong[0]
-            raise DatasetError(
-                f"{folder}: {name} of episode {row} is {episodes[name][row]}; expected {values[row]}: {MEND}."
-            )
+    difference = first_difference(episodes, expected)
+    if difference is not None:
+        name, row, found, wanted = difference
+        raise DatasetError(f"{folder}: {name} of episode {row} is {found}; expected {wanted}: {MEND}.")
     if stops[-1] != info.total_frames:
         raise DatasetError(
             f"{folder}: its episodes have {stops[-1]} frames, info.json says {info.total_frames}: {MEND}."

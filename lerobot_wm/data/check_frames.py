@@ -7,7 +7,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from lerobot_wm.data.check_info import MEND, Info, read_file
-from lerobot_wm.data.check_tables import check_columns, read_numbers, read_whole
+from lerobot_wm.data.check_tables import check_columns, first_difference, read_numbers, read_whole
 from lerobot_wm.data.errors import DatasetError
 
 _WHOLE = ("index", "episode_index", "frame_index", "task_index")
@@ -62,14 +62,13 @@ def _check_table(info: Info, path: Path, episodes: pd.DataFrame) -> None:
         "frame_index": frame,
         "task_index": table["task_index"].clip(upper=info.total_tasks - 1).to_numpy(),
     }
-    for name, values in expected.items():
-        wrong = np.flatnonzero(table[name].to_numpy() != values)
-        if len(wrong):
-            row = wrong[0]
-            raise DatasetError(
-                f"{path}: {name} of row {row} is {table[name][row]}; expected {values[row]}: frames are there twice or "
-                f"out of order, or the file is another one's; {MEND}."
-            )
+    difference = first_difference(table, expected)
+    if difference is not None:
+        name, row, found, wanted = difference
+        raise DatasetError(
+            f"{path}: {name} of row {row} is {found}; expected {wanted}: frames are there twice or "
+            f"out of order, or the file is another one's; {MEND}."
+        )
     if not (table["timestamp"] - frame / info.fps).abs().lt(0.5 / info.fps).all():
         raise DatasetError(
             f"{path}: its timestamps are not those of {info.fps:g} frames per second, as info.json says: set fps there "

@@ -1,6 +1,6 @@
 """Columns of numbers from a parquet file that may come from anywhere."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,23 @@ def read_whole(path: Path) -> None:
         DatasetError: One is damaged.
     """
     read_file(path, lambda path: sum(len(rows) for rows in pq.ParquetFile(path).iter_batches()))
+
+
+def first_difference(
+    table: pd.DataFrame, expected: Mapping[str, np.ndarray]
+) -> tuple[str, int, object, object] | None:
+    """Where a table is not as expected first: column, row, what is there and what should be; None where it is.
+
+    Args:
+        table: N rows.
+        expected: Values (N,) by column, looked at in their order.
+    """
+    for name, values in expected.items():
+        wrong = np.flatnonzero(table[name].to_numpy() != values)
+        if len(wrong):
+            row = int(wrong[0])
+            return name, row, table[name][row], values[row]
+    return None
 
 
 def read_numbers(path: Path, whole: Sequence[str], real: Sequence[str]) -> pd.DataFrame:

@@ -5,6 +5,7 @@ with o_{t+1}.
 """
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from lerobot_wm.constants import (
     VARIATION,
 )
 
+COLLECTION_RECORD = Path("meta", "collection.json")  # how `lerobot-wm collect` made the dataset
 STATE_NAMES = ["x", "y", "z", "gripper"]
 
 

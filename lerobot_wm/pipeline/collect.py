@@ -11,11 +11,12 @@ import draccus
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import CAMERA_NAME, REPORTED_VARIATION_SET
+from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.hub.dataset_card import push_demonstrations
 from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.pipeline.collect_config import CollectConfig, plan_shards
 from lerobot_wm.pipeline.collect_record import ShardRecord
-from lerobot_wm.pipeline.collect_report import COLLECTION_RECORD, print_summary, write_collection_record
+from lerobot_wm.pipeline.collect_report import print_summary, write_collection_record
 from lerobot_wm.pipeline.collect_shards import TEMPORARY_PREFIX, Shard
 from lerobot_wm.pipeline.collect_workers import write_missing_shards
 from lerobot_wm.pipeline.merge import merge_datasets

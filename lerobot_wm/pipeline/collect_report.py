@@ -10,11 +10,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.envs.tasks import expert_name
 from lerobot_wm.pipeline.collect_record import ShardRecord
 from lerobot_wm.pipeline.collect_shards import versions
-
-COLLECTION_RECORD = Path("meta", "collection.json")
 
 
 def write_collection_record(

@@ -3,9 +3,9 @@
 import json
 from pathlib import Path
 
-from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+
+from lerobot_wm.pipeline.training_run import checkpoint_file
 
 
 def check_processors(checkpoint: str | Path, revision: str | None) -> None:
@@ -21,13 +21,8 @@ def check_processors(checkpoint: str | Path, revision: str | None) -> None:
         ValueError: A file is no list of registered steps.
     """
     for name in (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME):
-        path = Path(checkpoint) / f"{name}.json"
-        if not Path(checkpoint).is_dir():
-            try:
-                path = Path(hf_hub_download(str(checkpoint), path.name, revision=revision))
-            except EntryNotFoundError:
-                continue
-        if path.is_file():
+        path = checkpoint_file(checkpoint, f"{name}.json", revision)
+        if path is not None:
             _check(path)
 
 

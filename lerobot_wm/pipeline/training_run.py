@@ -11,12 +11,22 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME
 
 def training_config(policy_path: Path | None) -> dict[str, Any]:
     """The settings of the run that trained a checkpoint (folder or Hub id); empty where it does not tell."""
-    if policy_path is None:
-        return {}
-    file = policy_path / TRAIN_CONFIG_NAME
-    if not policy_path.is_dir():
-        try:
-            file = Path(hf_hub_download(str(policy_path), TRAIN_CONFIG_NAME))
-        except EntryNotFoundError:
-            return {}
-    return json.loads(file.read_text()) if file.exists() else {}
+    file = None if policy_path is None else checkpoint_file(policy_path, TRAIN_CONFIG_NAME)
+    return {} if file is None else json.loads(file.read_text())
+
+
+def checkpoint_file(checkpoint: str | Path, name: str, revision: str | None = None) -> Path | None:
+    """A file of a checkpoint; None where it has no such file.
+
+    Args:
+        checkpoint: Folder or Hub id.
+        name: Of the file.
+        revision: Of the Hub; None takes its main branch.
+    """
+    path = Path(checkpoint) / name
+    if Path(checkpoint).is_dir():
+        return path if path.is_file() else None
+    try:
+        return Path(hf_hub_download(str(checkpoint), name, revision=revision))
+    except EntryNotFoundError:
+        return None

@@ -92,7 +92,7 @@ def camera_images(config: ImagePolicyConfig, batch: Mapping[str, Tensor]) -> Ten
     return stack_images([batch[key] for key in config.cameras], config.image_size)
 
 
-def check_images(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:
+def check_observation(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:
     """Check what a policy is shown at test time: each camera (B, C, H, W), and `observation.state` (B, P).
 
     Raises:

@@ -9,7 +9,7 @@ from torch import Tensor
 from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.augment import random_crop
 from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder
-from lerobot_wm.policies.cameras import camera_images, check_images
+from lerobot_wm.policies.cameras import camera_images, check_observation
 from lerobot_wm.policies.e2e_config import E2EConfig
 from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
 
@@ -69,7 +69,7 @@ class E2EPolicy(MultiTaskPolicy):
         Raises:
             ValueError: A camera is missing or has another size than in training, or the task is unknown.
         """
-        check_images(self.config, batch)
+        check_observation(self.config, batch)
         images, state = camera_images(self.config, batch), batch[OBS_STATE]
         observation = self.observation(images, state, self.one_hot_tasks(batch, state.shape[0]))
         action = self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))

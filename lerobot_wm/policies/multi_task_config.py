@@ -2,16 +2,16 @@
 
 from dataclasses import dataclass, field
 
-from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import LRSchedulerConfig
 
 from lerobot_wm.constants import ACTION, OBS_STATE
-from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, default_dtype, feature_dim
+from lerobot_wm.policies.features import default_dtype, feature_dim
 from lerobot_wm.policies.optim import FusedAdamConfig
+from lerobot_wm.policies.single_frames import SingleFramesConfig
 
 
 @dataclass
-class MultiTaskConfig(PreTrainedConfig):
+class MultiTaskConfig(SingleFramesConfig):
     """A policy for one or several tasks: small networks, one-hot task ids, Adam at a constant rate.
 
     Args:
@@ -31,9 +31,6 @@ class MultiTaskConfig(PreTrainedConfig):
     lr: float = 3e-4
     dtype: str | None = None
     tasks: list[str] = field(default_factory=list)
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict(IDENTITY_NORMALIZATION)
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,21 +48,6 @@ class MultiTaskConfig(PreTrainedConfig):
     def action_dim(self) -> int:
         """Size of the action."""
         return feature_dim(self.output_features, ACTION, "The dataset")
-
-    @property
-    def observation_delta_indices(self) -> list[int] | None:
-        """Single frames."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> list[int] | None:
-        """Single frames."""
-        return None
-
-    @property
-    def reward_delta_indices(self) -> list[int] | None:
-        """Single frames."""
-        return None
 
     def get_optimizer_preset(self) -> FusedAdamConfig:
         """Adam without clipping (IQL reference implementation)."""

@@ -2,19 +2,20 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import draccus
-from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.configs import PreTrainedConfig
 
 from lerobot_wm.constants import ACTION
 from lerobot_wm.policies.cameras import ImagePolicyConfig
-from lerobot_wm.policies.features import IDENTITY_NORMALIZATION, feature_dim
+from lerobot_wm.policies.features import feature_dim
+from lerobot_wm.policies.single_frames import SingleFramesConfig
 
 
 @dataclass
-class WorldModelConfig(ImagePolicyConfig):
+class WorldModelConfig(ImagePolicyConfig, SingleFramesConfig):
     """A policy type that makes latents and no actions: a world model, or what stands in its place.
 
     `--policy.world_model_path` and `lerobot-wm encode` take the checkpoints of every such type. A policy on its latents
@@ -28,10 +29,6 @@ class WorldModelConfig(ImagePolicyConfig):
     predicts_images: ClassVar[bool] = False
     scales_latents: ClassVar[bool] = True
 
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict(IDENTITY_NORMALIZATION)
-    )
-
     @property
     @abstractmethod
     def latent_dim(self) -> int:
@@ -41,21 +38,6 @@ class WorldModelConfig(ImagePolicyConfig):
     def action_dim(self) -> int | None:
         """Size of the actions that the model reads; None where it reads none."""
         return feature_dim(self.output_features, ACTION, "The dataset")
-
-    @property
-    def observation_delta_indices(self) -> list[int] | None:
-        """Single frames."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> list[int] | None:
-        """Single frames."""
-        return None
-
-    @property
-    def reward_delta_indices(self) -> list[int] | None:
-        """Single frames."""
-        return None
 
     def validate_features(self) -> None:
         """Choose the cameras.

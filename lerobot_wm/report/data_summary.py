@@ -13,11 +13,11 @@ from PIL import Image
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.policies.rewards import reward_columns
 from lerobot_wm.report.episodes import episodes_by_task
 from lerobot_wm.report.inline import WEBP, data_uri
 
-COLLECTION_RECORD = Path("meta", "collection.json")  # of `lerobot-wm collect`
 PICTURE_SIZE = 256  # pixels that a picture is at most wide and high
 
 

@@ -17,6 +17,7 @@ from lerobot_wm.policies.cameras import camera_images, side_by_side
 from lerobot_wm.policies.frozen_encoder import load_encoder
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from lerobot_wm.report.episodes import episodes_by_task
 from lerobot_wm.world_model.model import WorldModel
 
 CONTEXT = 5  # frames the model sees
@@ -63,19 +64,17 @@ def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | Non
     Raises:
         ValueError: no episode is long enough.
     """
-    fps = LeRobotDatasetMetadata(repo_id, root=root).fps
-    times = [step / fps for step in range(WINDOW)]
+    meta = LeRobotDatasetMetadata(repo_id, root=root)
+    by_task = episodes_by_task(meta, min_length=WINDOW)
+    if not by_task:
+        raise ValueError(f"{repo_id} has no episode of {WINDOW} frames, which open-loop prediction needs.")
+    first_frame = meta.episodes["dataset_from_index"][:]
+    times = [step / meta.fps for step in range(WINDOW)]
     keys = (*policy.config.cameras, ACTION, OBS_STATE)
     dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(keys, times))
-    starts: dict[str, list[int]] = {}
-    for episode in dataset.meta.episodes:
-        if episode["length"] >= WINDOW:
-            starts.setdefault(episode["tasks"][0], []).append(episode["dataset_from_index"])
-    if not starts:
-        raise ValueError(f"{repo_id} has no episode of {WINDOW} frames, which open-loop prediction needs.")
     return [
-        predict(policy, task, [dataset[i] for i in indices[-EPISODES_PER_TASK:]])
-        for task, indices in tqdm(starts.items(), desc="Imagining", unit="task")
+        predict(policy, task, [dataset[first_frame[i]] for i in episodes[-EPISODES_PER_TASK:]])
+        for task, episodes in tqdm(by_task.items(), desc="Imagining", unit="task")
     ]
 
 

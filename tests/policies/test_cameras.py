@@ -7,7 +7,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_wm.data.resize import resize_images
-from lerobot_wm.policies.cameras import camera_images, check_images, side_by_side, stack_images
+from lerobot_wm.policies.cameras import camera_images, check_observation, side_by_side, stack_images
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.config import RSSMConfig
@@ -100,12 +100,12 @@ def test_what_is_shown_is_checked_camera_by_camera() -> None:
     config = make_config()
     config.validate_features()
     left = torch.zeros(1, 3, 64, 64)
-    check_images(config, {LEFT: left, RIGHT: torch.zeros(1, 3, 48, 96)})
+    check_observation(config, {LEFT: left, RIGHT: torch.zeros(1, 3, 48, 96)})
     with pytest.raises(ValueError, match=r"right' is \(3, 64, 64\).*\(3, 48, 96\)"):
-        check_images(config, {LEFT: left, RIGHT: left})
+        check_observation(config, {LEFT: left, RIGHT: left})
     with pytest.raises(
         ValueError, match=r"right'; the observation has observation\.images\.left\. .*rename_map"
     ):
-        check_images(config, {LEFT: left})
+        check_observation(config, {LEFT: left})
     with pytest.raises(ValueError, match=r"right'; the observation has observation\.images\.left\."):
         camera_images(config, {LEFT: left[:, None], f"{LEFT}_is_pad": left})

@@ -13,8 +13,8 @@ from lerobot.utils.io_utils import write_video
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.report.build import ReportConfig, ReportDatasetConfig, report
-from lerobot_wm.report.data_summary import COLLECTION_RECORD
 from lerobot_wm.report.open_loop import WINDOW
 from lerobot_wm.report.records import Record, record_line
 from tests.recording import camera, record, vector

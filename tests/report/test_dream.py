@@ -96,13 +96,17 @@ def make_checkpoint(path: Path, policy_type: str, **settings: Any) -> Path:
         config_class = {"wm_bc": WMBCConfig, "wm_iql": WMIQLConfig}[policy_type]
         policy_class = {"wm_bc": WMBCPolicy, "wm_iql": WMIQLPolicy}[policy_type]
         settings = {"use_latent": True, "tasks": TASKS} | settings
+        world_model = WMRSSMConfig(rssm=rssm, input_features=inputs, **common)
         if not settings["use_latent"]:
             inputs = {OBS_STATE: inputs[OBS_STATE]}
         if settings.get("use_environment_state"):
             inputs |= {OBS_ENV_STATE: PolicyFeature(FeatureType.ENV, (5,))}
         policy = policy_class(
             config_class(
-                rssm=rssm if settings["use_latent"] else None, input_features=inputs, **common, **settings
+                world_model=world_model if settings["use_latent"] else None,
+                input_features=inputs,
+                **common,
+                **settings,
             )
         )
     low, high = torch.full((3,), -0.5), torch.full((3,), 1.5)
