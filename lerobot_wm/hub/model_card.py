@@ -17,6 +17,7 @@ from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.hub.markdown import Markdown, render
 from lerobot_wm.hub.train_command import train_command
 from lerobot_wm.nn.conv import IMAGE_SIZE
+from lerobot_wm.policies.world_model_config import WorldModelConfig
 
 PACKAGES = ("lerobot_policy_wm", "lerobot", "torch")
 IMAGINATION = "imagination.webp"  # beside the card, where there is one
@@ -77,6 +78,7 @@ def model_card(
             no such file.
     """
     settings = draccus.encode(config)
+    makes_latents = isinstance(config, WorldModelConfig)
     datasets = [data.latents.source_repo_id if data.latents else data.repo_id] if data else None
     metadata = ModelCardData(
         license=config.license or "apache-2.0",
@@ -89,6 +91,8 @@ def model_card(
         "model_card.md.j2",
         type=config.type,
         settings=settings,
+        makes_latents=makes_latents,
+        latent_dim=config.latent_dim if makes_latents else None,
         repo_id=repo_id,
         module=policy_class.__module__,
         class_name=policy_class.__name__,

@@ -9,6 +9,8 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import partialmethod
+from io import StringIO
 from multiprocessing import get_context
 
 import torch
@@ -35,6 +37,8 @@ _worker_run: Callable[[str], list[Record]]
 def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
     global _worker_run
     drop_remarks()
+    # LeRobot's bars of several processes would overwrite each other, and the parent's.
+    tqdm.__init__ = partialmethod(tqdm.__init__, file=StringIO())  # type: ignore[assignment, method-assign]
     torch.set_num_threads(threads)
     _worker_run = TaskRunner(cfg).run
 
@@ -94,8 +98,8 @@ def _write_records(cfg: EvaluateConfig, tasks: list[str]) -> list[Record]:
             progress.update(len(of_task))
             if progress.disable:
                 logging.info("%d of %d rollouts", len(records), total)
-    unfinished.rename(cfg.records_file)
     _write_info(cfg, records, seconds=time.perf_counter() - started)
+    unfinished.rename(cfg.records_file)  # last: where it is, all is
     return records
 
 

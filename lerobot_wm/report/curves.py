@@ -7,6 +7,8 @@ from pathlib import Path
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
+from lerobot_wm.report.inline import short
+
 LOG_NAME = "train_log.jsonl"
 # LeRobot's counters and timings, which say nothing about learning.
 BOOKKEEPING = {"steps", "samples", "episodes", "epochs", "update_s", "dataloading_s", "samples_per_s"}
@@ -73,7 +75,7 @@ def _figure(name: str, runs: dict[str, Curves]) -> Figure:
                     (2 * index + index // 10) % 20
                 ],  # the ten strong ones, then their pale partners
                 linewidth=1.2,
-                label=None if number else label,
+                label=None if number else short(label),
             )
     lowest, highest = axes.dataLim.ymin, axes.dataLim.ymax
     if lowest > 0 and highest > 10 * lowest:  # a loss whose first steps would hide the rest

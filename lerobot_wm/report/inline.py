@@ -4,6 +4,7 @@ import io
 from base64 import b64encode
 
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 SVG, PNG, WEBP, MP4 = "image/svg+xml", "image/png", "image/webp", "video/mp4"
 
@@ -13,9 +14,16 @@ def data_uri(content: bytes, mime_type: str) -> str:
     return f"data:{mime_type};base64,{b64encode(content).decode()}"
 
 
+def short(name: str, limit: int = 32) -> str:
+    """A name that leaves room for the figure it stands beside."""
+    return name if len(name) <= limit else f"{name[: limit - 1]}…"
+
+
 def figure_bytes(figure: Figure, mime_type: str) -> bytes:
     """A matplotlib figure as a PNG or SVG file."""
     buffer = io.BytesIO()
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # the name of a task or arm may hold $
     # Date=None: the same figure gives the same bytes.
     metadata = {"Date": None} if mime_type == SVG else {}
     figure.savefig(buffer, format="svg" if mime_type == SVG else "png", dpi=100, metadata=metadata)

@@ -127,15 +127,8 @@ def strips_figure(results: list[OpenLoop]) -> Figure:
     for result, (above, below) in zip(results, axes.reshape(len(results), 2, -1), strict=True):
         above[0].imshow(_pixels(result.truth[CONTEXT - 1]))
         above[0].set_title("last seen", fontsize=8)
-        name = below[0].text(
-            0,
-            0.5,
-            fill(result.task, 14),
-            fontsize=8,
-            transform=below[0].transAxes,
-            va="center",
-            parse_math=False,  # a task may speak of $
-        )
+        transform = below[0].transAxes
+        name = below[0].text(0, 0.5, fill(result.task, 14), fontsize=8, transform=transform, va="center")
         name.set_in_layout(False)  # or it would widen its column
         for column, horizon in enumerate(HORIZONS, start=1):
             above[column].imshow(_pixels(result.truth[CONTEXT - 1 + horizon]))

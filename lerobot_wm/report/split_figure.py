@@ -3,6 +3,7 @@
 from matplotlib.figure import Figure
 
 from lerobot_wm.report.arms import by_arm
+from lerobot_wm.report.inline import short
 from lerobot_wm.report.records import Record
 from lerobot_wm.report.statistics import in_split, success_rate
 
@@ -24,7 +25,7 @@ def split_figure(records: list[Record]) -> Figure:
                 axes.plot(rate.interval, [row + shift] * 2, color=colour, linewidth=2, alpha=0.5)
                 axes.plot(rate.percent, row + shift, "o", color=colour, markersize=6)
         axes.plot([], [], "o-", color=colour, label=split)
-    axes.set_yticks(range(len(arms)), list(arms))
+    axes.set_yticks(range(len(arms)), [short(arm) for arm in arms])
     axes.invert_yaxis()
     axes.set_xlim(0, 100)
     axes.set_xlabel("success, % of rollouts over all tasks")
