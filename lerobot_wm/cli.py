@@ -67,13 +67,13 @@ def main() -> None:
     if name not in COMMANDS:
         sys.exit(f"lerobot-wm: no command '{name}'; expected one of {', '.join(COMMANDS)}.")
     drop_remarks()
-    try:
-        arguments = load_plugins(sys.argv[2:])
-    except PluginLoadError as error:
-        sys.exit(f"lerobot-wm {name}: {error}")
-    # LeRobot's parsers read sys.argv themselves: hand the subcommand its own argument list.
-    sys.argv = [f"lerobot-wm {name}", *arguments]
-    with exit_with_one_line(sys.argv[0]):
+    with exit_with_one_line(f"lerobot-wm {name}"):
+        try:
+            arguments = load_plugins(sys.argv[2:])
+        except PluginLoadError as error:
+            sys.exit(f"lerobot-wm {name}: {error}")
+        # LeRobot's parsers read sys.argv themselves: hand the subcommand its own argument list.
+        sys.argv = [f"lerobot-wm {name}", *arguments]
         importlib.import_module(COMMANDS[name][0]).main()
 
 

@@ -1,20 +1,24 @@
 """Collections in several processes, killed and started again."""
 
-import hashlib
 import json
 import os
+import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.pipeline.collect import CollectConfig, collect, plan_shards
-from lerobot_wm.pipeline.collect_shards import SHARD_RECORD
+from lerobot_wm.pipeline.collect_shards import SHARD_RECORD, TEMPORARY_PREFIX
+from tests.faults.killing import WatchedCommands, digests
+from tests.faults.running import processes_of, wait_until
 
 EPISODES = 2
 # One more than there are workers: the third shard is begun when the first is finished.
@@ -30,52 +34,54 @@ def command(root: Path) -> list[str]:
 
 
 def contents(root: Path) -> dict[str, str]:
-    """SHA-256 of every data file and video, and the record without its wall time."""
-    digests = {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for folder in ("data", "videos")
-        for path in sorted((root / folder).rglob("*.*"))
-        if path.is_file()
-    }
-    record = json.loads((root / "meta" / "collection.json").read_text())
-    return {**digests, "episodes": json.dumps(record["episodes"])}
-
-
-def wait_until(condition: Callable[[], object], seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "timed out"
-        time.sleep(0.01)
-
-
-def processes_of(group: int) -> list[int]:
-    """Living processes of a process group."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:  # it has just ended
-            continue
-        if int(fields[2]) == group and fields[0] != "Z":
-            found.append(int(stat.parent.name))
-    return found
+    """SHA-256 of every file of the dataset, and its record without the wall time."""
+    record = json.loads((root / COLLECTION_RECORD).read_text())
+    del record["seconds"]
+    return {**digests(root), str(COLLECTION_RECORD): json.dumps(record)}
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset as one process makes it in one go."""
-    root = tmp_path_factory.mktemp("undisturbed") / "dataset"
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WatchedCommands]:
+    commands = WatchedCommands(tmp_path_factory.mktemp("notes"))
+    yield commands
+    commands.close()
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shards as one process makes them in one go."""
+    root = tmp_path_factory.mktemp("collected") / "dataset"
     config = CollectConfig(
-        repo_id="user/small", root=root, tasks=TASKS, episodes_per_task=EPISODES, num_workers=1
+        repo_id="user/small",
+        root=root,
+        tasks=TASKS,
+        episodes_per_task=EPISODES,
+        num_workers=1,
+        shard="1/1",
     )
     return collect(config)
+
+
+@pytest.fixture(scope="module")
+def merging(collected: Path, commands: WatchedCommands) -> tuple[Path, list[str]]:
+    """The dataset that is merged of them without disturbance, and the touches of that."""
+    root = collected.with_name("merged") / "dataset"
+    shutil.copytree(collected, root.with_name("dataset.shards"))
+    commands.run(" ".join(command(root)[3:]), root.parent)
+    return root, commands.touches
+
+
+@pytest.fixture(scope="module")
+def undisturbed(merging: tuple[Path, list[str]]) -> Path:
+    """The dataset as it is made without disturbance."""
+    return merging[0]
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for left-over processes in /proc")
 def test_killed_and_started_again(undisturbed: Path, tmp_path: Path) -> None:
     """Two workers, killed when a shard is finished: nothing is lost, left over or different."""
     root, shards = tmp_path / "dataset", tmp_path / "dataset.shards"
-    run = subprocess.Popen(command(root), start_new_session=True, stderr=subprocess.DEVNULL)
+    run = subprocess.Popen(command(root), process_group=0, stderr=subprocess.DEVNULL)
     wait_until(lambda: list(shards.glob(f"*-v3-*/{SHARD_RECORD}")) or run.poll() is not None)
     assert run.poll() is None
     os.kill(run.pid, signal.SIGKILL)
@@ -102,6 +108,57 @@ def test_killed_and_started_again(undisturbed: Path, tmp_path: Path) -> None:
     assert "libx264" not in again.stderr
     assert not shards.exists()
     assert contents(root) == contents(undisturbed)
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks for left-over processes in /proc")
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_killed_at_random_moments(kills: int, undisturbed: Path, tmp_path: Path) -> None:
+    """All processes of a collection at once, again and again."""
+    root, shards = tmp_path / "dataset", tmp_path / "dataset.shards"
+    moments = random.Random(0)
+    killed = 0
+    while killed < kills:
+        if killed_at_random(root, moments):
+            killed += 1
+            for shard in shards.glob("[!u]*"):  # not in work: whole
+                assert LeRobotDataset("user/shard", root=shard).num_episodes == EPISODES
+        if root.exists():  # killed at its very end, or it was faster
+            assert contents(root) == contents(undisturbed)
+            shutil.rmtree(root)
+            shutil.rmtree(shards, ignore_errors=True)
+    subprocess.run(command(root), check=True, capture_output=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
+    assert contents(root) == contents(undisturbed)
+
+
+def killed_at_random(root: Path, moments: random.Random) -> bool:
+    """Go on with a collection, and kill its processes, unless they are faster, once one has begun a shard."""
+    begun = set(root.parent.glob(f"dataset.shards/{TEMPORARY_PREFIX}*"))
+    start = time.monotonic()
+    run = subprocess.Popen(command(root), process_group=0, stderr=subprocess.DEVNULL)
+    wait_until(
+        lambda: set(root.parent.glob(f"dataset.shards/{TEMPORARY_PREFIX}*")) - begun or run.poll() is not None
+    )
+    time.sleep(moments.uniform(0, time.monotonic() - start))  # as slow as the machine is now
+    if run.poll() is None:
+        os.killpg(run.pid, signal.SIGKILL)
+    wait_until(lambda: not processes_of(run.pid), seconds=10)
+    return run.wait() == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("kills", [1, pytest.param(10, marks=pytest.mark.slow)])
+def test_killed_while_it_merges(
+    kills: int, merging: tuple[Path, list[str]], collected: Path, commands: WatchedCommands, tmp_path: Path
+) -> None:
+    expected, touches = merging
+    arguments = " ".join(command(tmp_path / "dataset")[3:])
+    for kill_at in random.Random(0).sample(range(len(touches)), kills):
+        shutil.copytree(collected, tmp_path / "dataset.shards")
+        assert commands.run(arguments, tmp_path, kill_at)
+        commands.run(arguments, tmp_path)
+        assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
+        assert contents(tmp_path / "dataset") == contents(expected)
+        shutil.rmtree(tmp_path / "dataset")
 
 
 def test_plan_covers_every_episode_once() -> None:

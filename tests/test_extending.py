@@ -11,7 +11,6 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 
-from lerobot_wm.hub.model_card import model_card
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from tests.documents import blocks, commands, with_flags
 from tests.flags import TRAIN_FLAGS
@@ -63,10 +62,10 @@ def test_the_world_model_of_the_page(
         f"--dataset.repo_id=test/latents --dataset.root={tmp_path / 'latents'} --output_dir={tmp_path / 'bc'}",
     )
     gru = get_policy_class("wm_gru").from_pretrained(world_model)
-    card = str(model_card(type(gru), gru.config, "user/gru", None, None))
-    assert "encoder = WMGRUPolicy.from_pretrained('user/gru').world_model" in card
+    card = str(gru.generate_model_card("user/data", "gru", None, None))
+    assert "encoder = WMGRUPolicy.from_pretrained('gru').world_model" in card
     assert "select_action" not in card
-    assert "--policy.world_model_path=user/gru" in card
+    assert "--policy.world_model_path=gru" in card
     (world_model / "model.safetensors").unlink()
     policy = get_policy_class("wm_bc").from_pretrained(
         tmp_path / "bc" / "checkpoints" / "last" / "pretrained_model"

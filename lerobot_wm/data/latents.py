@@ -36,7 +36,7 @@ class LatentRecord:
         """Read the record of the dataset at `root`.
 
         Raises:
-            ValueError: The dataset carries none.
+            ValueError: The dataset carries none, or one that is damaged.
         """
         path = root / RECORD_PATH
         if not path.is_file():
@@ -44,7 +44,13 @@ class LatentRecord:
                 f"{path} is missing, so nothing tells which world model these latents are of: "
                 "encode the dataset again with `lerobot-wm encode`."
             )
-        return cls(**json.loads(path.read_text()))
+        try:
+            return cls(**json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError) as error:
+            raise ValueError(
+                f"{path} is no record of latents ({error}): it was cut short or damaged; copy the dataset again, "
+                "whole, or encode it again with `lerobot-wm encode`."
+            ) from error
 
     def check_world_model(self, fingerprint: str | None, path: str | None) -> None:
         """Refuse latents of another world model.

@@ -149,6 +149,7 @@ class MetaworldMTEnv(gym.Env):
         if self._sim is not None:
             for key in self._render_keys.values():
                 Renderer.release(key)
+            self._renderers = {}
             self._sim = None
 
     def _build(self) -> None:

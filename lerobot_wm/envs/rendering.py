@@ -25,6 +25,11 @@ GL_HELP = (
     "    apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri\n"
     "and use MUJOCO_GL=egl (the default without a display)."
 )
+try:
+    import mujoco  # which loads what MUJOCO_GL names, and without libEGL raises an AttributeError of PyOpenGL
+except (AttributeError, RuntimeError, OSError) as error:
+    raise RuntimeError(GL_HELP.format(backend=os.environ.get("MUJOCO_GL"))) from error
+
 MAX_GEOMS = 1000  # of a scene; Meta-World's largest has about 100
 
 
@@ -49,8 +54,6 @@ class Renderer:
     """
 
     def __init__(self, key: RenderKey, model: Any) -> None:
-        import mujoco
-
         self.users = 0
         self._upside_down = key.camera in UPSIDE_DOWN
         _ensure_gl_context()
@@ -89,8 +92,6 @@ class Renderer:
         return _gl_thread.submit(self._render, model, data).result()
 
     def _render(self, model: Any, data: Any) -> np.ndarray:
-        import mujoco
-
         image = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
         # Every task's renderer has its own framebuffer in the one context: select ours.
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)

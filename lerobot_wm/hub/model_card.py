@@ -17,7 +17,6 @@ from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.hub.markdown import Markdown, render
 from lerobot_wm.hub.train_command import train_command
 from lerobot_wm.nn.conv import IMAGE_SIZE
-from lerobot_wm.policies.world_model_config import WorldModelConfig
 
 PACKAGES = ("lerobot_policy_wm", "lerobot", "torch")
 IMAGINATION = "imagination.webp"  # beside the card, where there is one
@@ -64,6 +63,8 @@ def model_card(
     data: TrainingData | None,
     results: str | None = None,
     imagined_tasks: list[str] | None = None,
+    *,
+    makes_latents: bool,
 ) -> ModelCard:
     """Write the card.
 
@@ -76,9 +77,9 @@ def model_card(
         results: Tables of an evaluation, in Markdown.
         imagined_tasks: What the columns of `IMAGINATION` show, which is published with the card; None where there is
             no such file.
+        makes_latents: Whether it is a world model, or what stands in its place, and not a policy that acts.
     """
     settings = draccus.encode(config)
-    makes_latents = isinstance(config, WorldModelConfig)
     datasets = [data.latents.source_repo_id if data.latents else data.repo_id] if data else None
     metadata = ModelCardData(
         license=config.license or "apache-2.0",
@@ -92,7 +93,6 @@ def model_card(
         type=config.type,
         settings=settings,
         makes_latents=makes_latents,
-        latent_dim=config.latent_dim if makes_latents else None,
         repo_id=repo_id,
         module=policy_class.__module__,
         class_name=policy_class.__name__,

@@ -11,6 +11,7 @@ import draccus
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import CAMERA_NAME, REPORTED_VARIATION_SET
+from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.hub.dataset_card import push_demonstrations
 from lerobot_wm.hub.errors import check_can_push
@@ -36,8 +37,14 @@ def collect(config: CollectConfig) -> Path:
 
     Raises:
         FileExistsError: if the folder holds anything but this very dataset, or shards of other settings.
+        BlockingIOError: if another process collects this dataset, or this share of it.
         ValueError: if there are more jobs than shards, or a shard was not copied whole.
     """
+    with sole_writer(config.output_root, config.shard and config.shard.replace("/", "-of-")):
+        return _collect(config)
+
+
+def _collect(config: CollectConfig) -> Path:
     root = config.output_root
     folder = root.with_name(f"{root.name}.shards")
     if _is_complete(config, root):
@@ -129,8 +136,6 @@ def main() -> None:
     except draccus.ParsingError as error:
         # Why CollectConfig refused its flags is the cause.
         sys.exit(f"lerobot-wm collect: {error} {error.__cause__ or ''}")
-    except (ValueError, FileExistsError, RuntimeError) as error:
-        sys.exit(f"lerobot-wm collect: {error}")
     if config.push_to_hub and config.shard is None:
         push(config)
 

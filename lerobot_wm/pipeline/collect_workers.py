@@ -1,8 +1,6 @@
 """Writing shards, in this process or in several."""
 
 import multiprocessing
-import os
-import threading
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
@@ -10,6 +8,12 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lerobot_wm.pipeline.collect_shards import Shard, write_shard
+from lerobot_wm.pipeline.errors import (
+    end_with_parent,
+    explained_to_parent,
+    interrupts_held,
+    workers_interrupted,
+)
 from lerobot_wm.pipeline.quiet import silence
 
 
@@ -31,8 +35,12 @@ def _write_in_parallel(shards: list[Shard], folder: Path, num_workers: int, bar:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["lerobot_wm.pipeline.collect_workers"])
     finished = context.SimpleQueue()
-    with ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(finished,)) as pool:
-        pending = {pool.submit(_write_and_count, shard, folder) for shard in shards}
+    with (
+        ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(finished,)) as pool,
+        workers_interrupted(),
+    ):
+        with interrupts_held():
+            pending = {pool.submit(_write_and_count, shard, folder) for shard in shards}
         while pending:
             done, pending = wait(pending, timeout=0.2, return_when=FIRST_EXCEPTION)
             while not finished.empty():
@@ -50,17 +58,10 @@ _finished: "SimpleQueue[None]"  # of a worker: one item per episode it has saved
 def _start_worker(finished: "SimpleQueue[None]") -> None:
     global _finished
     _finished = finished
-    # A worker must not outlive a killed parent: it would write into the next run's folder.
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    end_with_parent()
     silence()
 
 
-def _exit_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
 def _write_and_count(shard: Shard, folder: Path) -> None:
-    write_shard(shard, folder, on_episode=lambda: _finished.put(None))
+    with explained_to_parent():
+        write_shard(shard, folder, on_episode=lambda: _finished.put(None))

@@ -21,6 +21,7 @@ from lerobot_wm.constants import OBS_LATENT, OBS_STATE
 from lerobot_wm.data.cache import cache_root
 from lerobot_wm.data.fingerprint import dataset_fingerprint, weights_fingerprint
 from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.hub.dataset_card import license_of, push_latents
 from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.pipeline.encode_episodes import episode_batches
@@ -28,6 +29,7 @@ from lerobot_wm.pipeline.encode_parts import LatentParts
 from lerobot_wm.pipeline.quiet import quiet
 from lerobot_wm.pipeline.share import Share, refuse_difference
 from lerobot_wm.pipeline.source import SourceConfig
+from lerobot_wm.policies.fits import check_encoder_fits
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_encoder import EncoderPolicy, load_encoder
 
@@ -95,7 +97,8 @@ def encode(
 
     Raises:
         FileExistsError: `output_root` is there already, or `<output_root>.parts` holds other latents.
-        ValueError: The dataset lacks a camera of the world model or proprioception, or latents are not finite.
+        ValueError: The dataset lacks a camera of the world model or proprioception, or has actions of another size
+            than it was trained with, or latents are not finite.
     """
     record, parts = _begin(policy, source, output_root, sample_seed)
     batches = episode_batches(source)
@@ -142,7 +145,9 @@ def _begin(
     policy: EncoderPolicy, source: LeRobotDataset, output_root: Path, sample_seed: int | None
 ) -> tuple[LatentRecord, LatentParts]:
     """Refuse what cannot be encoded; the record of the result, and the place of its latents."""
+    parts = output_root.with_name(f"{output_root.name}.parts")
     if output_root.exists():
+        shutil.rmtree(parts, ignore_errors=True)  # left by a run killed at its very end
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
     missing = [key for key in policy.config.cameras if key not in source.meta.camera_keys]
     if missing:
@@ -154,13 +159,14 @@ def _begin(
         raise ValueError(
             f"{source.repo_id} has no '{OBS_STATE}', which every policy on latents reads beside them."
         )
+    check_encoder_fits(policy.config, source.meta)
     record = _record(policy, source, sample_seed)
     made_of = {
         "world_model_fingerprint": record.world_model_fingerprint,
         "source_fingerprint": record.source_fingerprint,
         "sample_seed": str(sample_seed),
     }
-    return record, LatentParts(output_root.with_name(f"{output_root.name}.parts"), made_of)
+    return record, LatentParts(parts, made_of)
 
 
 def _record(policy: EncoderPolicy, source: LeRobotDataset, sample_seed: int | None) -> LatentRecord:
@@ -191,12 +197,13 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
     root = Path(meta.root)
     name = f"latents-{weights_fingerprint(policy.world_model)}-{dataset_fingerprint(root)}"
     output_root = cache_root(root) / name
-    if output_root.is_dir():
-        logger.info("Latents found in %s", output_root)
-    else:
-        logger.info("Encoding %s into %s", repo_id, output_root)
-        source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
-        encode(policy, source, f"{repo_id}_latents", output_root)
+    with sole_writer(output_root, wait=True):  # another training may be encoding it
+        if output_root.is_dir():
+            logger.info("Latents found in %s", output_root)
+        else:
+            logger.info("Encoding %s into %s", repo_id, output_root)
+            source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
+            encode(policy, source, f"{repo_id}_latents", output_root)
     return output_root
 
 
@@ -212,6 +219,11 @@ def main() -> None:
     cfg = draccus.parse(EncodeConfig)
     if cfg.push_to_hub:
         check_can_push(cfg.output_repo_id)
+    with sole_writer(cfg.output_root, cfg.shard and cfg.shard.replace("/", "-of-")):
+        _run(cfg)
+
+
+def _run(cfg: EncodeConfig) -> None:
     share = Share.parse(cfg.shard) if cfg.shard else None
     policy = load_encoder(cfg.world_model_path)
     policy.to(cfg.device or auto_select_torch_device())

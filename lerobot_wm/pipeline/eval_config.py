@@ -9,6 +9,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.variations import is_seen, split_variations
+from lerobot_wm.policies.fits import check_environment_fits
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
 
@@ -46,7 +47,8 @@ class EvaluateConfig(EvalPipelineConfig):
         """Refuse what cannot run, before anything is loaded.
 
         Raises:
-            ValueError: no policy, no seed, a rollout that would run twice, or a flag that belongs elsewhere.
+            ValueError: no policy, no seed, a rollout that would run twice, a flag that belongs elsewhere, or an
+                environment that the policy was not trained for.
             FileExistsError: the records file is there already.
         """
         if self.policy is None:
@@ -74,6 +76,11 @@ class EvaluateConfig(EvalPipelineConfig):
                 f"--eval.n_episodes={self.eval.n_episodes}, but there are only {n_variations} variations: "
                 f"use --eval.n_episodes={n_variations}."
             )
+        if self.policy.pretrained_path is None:
+            raise ValueError(
+                f"--policy.type={self.policy.type} alone would be untrained: give --policy.path=CHECKPOINT."
+            )
+        check_environment_fits(self.policy, self.env, self.rename_map)
 
     @property
     def records_file(self) -> Path:

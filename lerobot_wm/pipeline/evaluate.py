@@ -9,22 +9,32 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from copy import deepcopy
 from functools import partialmethod
 from io import StringIO
 from multiprocessing import get_context
 
 import torch
 from lerobot.configs import parser
+from lerobot.policies import make_policy
 from lerobot.utils.utils import init_logging
 from rich.console import Console
 from tqdm import tqdm
 
 from lerobot_wm.cores import usable_cores
+from lerobot_wm.data.lock import sole_writer
+from lerobot_wm.pipeline.errors import (
+    end_with_parent,
+    explained_to_parent,
+    interrupts_held,
+    workers_interrupted,
+)
 from lerobot_wm.pipeline.eval_config import EvaluateConfig
-from lerobot_wm.pipeline.processors import check_processors
+from lerobot_wm.pipeline.processors import check_policy_path, check_processors
 from lerobot_wm.pipeline.remarks import drop_remarks
 from lerobot_wm.pipeline.rollouts import TaskRunner, task_names
 from lerobot_wm.pipeline.wandb_log import log_evaluation, wandb_run
+from lerobot_wm.policies.multi_task_config import MultiTaskConfig
 from lerobot_wm.report.provenance import provenance
 from lerobot_wm.report.records import Record, record_line
 from lerobot_wm.report.statistics import ci95_summary, in_split
@@ -36,6 +46,7 @@ _worker_run: Callable[[str], list[Record]]
 
 def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
     global _worker_run
+    end_with_parent()
     drop_remarks()
     # LeRobot's bars of several processes would overwrite each other, and the parent's.
     tqdm.__init__ = partialmethod(tqdm.__init__, file=StringIO())  # type: ignore[assignment, method-assign]
@@ -44,7 +55,8 @@ def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
 
 
 def _run_in_worker(task: str) -> list[Record]:
-    return _worker_run(task)
+    with explained_to_parent():
+        return _worker_run(task)
 
 
 def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
@@ -55,10 +67,15 @@ def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
 def _rollouts_of_workers(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
     workers = min(cfg.num_workers, len(tasks))
     threads = max(1, usable_cores() // workers)
-    with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=(cfg, threads)
-    ) as pool:
-        yield from pool.map(_run_in_worker, tasks)
+    with (
+        ProcessPoolExecutor(
+            workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=(cfg, threads)
+        ) as pool,
+        workers_interrupted(),
+    ):
+        with interrupts_held():
+            of_tasks = pool.map(_run_in_worker, tasks)
+        yield from of_tasks
 
 
 def evaluate(cfg: EvaluateConfig) -> list[Record]:
@@ -68,10 +85,18 @@ def evaluate(cfg: EvaluateConfig) -> list[Record]:
 
     Raises:
         ValueError, FileExistsError: see `EvaluateConfig.validate`.
-        ValueError: the checkpoint's processors name code of their own.
+        BlockingIOError: another process writes these records.
+        ValueError, FileNotFoundError: the checkpoint is not whole, or its processors name code of their own.
     """
     cfg.validate()
+    with sole_writer(cfg.records_file):
+        return _evaluate(cfg)
+
+
+def _evaluate(cfg: EvaluateConfig) -> list[Record]:
     check_processors(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
+    if isinstance(cfg.policy, MultiTaskConfig):  # small: a broken one is found before environments are built
+        make_policy(deepcopy(cfg.policy), env_cfg=cfg.env, rename_map=cfg.rename_map)
     tasks = task_names(cfg)
     with wandb_run(cfg.wandb, cfg.policy.pretrained_path, cfg.output_dir) as run:
         records = _write_records(cfg, tasks)
@@ -132,4 +157,5 @@ def _evaluate_from_command_line(cfg: EvaluateConfig) -> None:
 def main() -> None:
     """Entry point of `lerobot-wm eval`."""
     init_logging()
+    check_policy_path()
     _evaluate_from_command_line()  # type: ignore[call-arg]

@@ -19,6 +19,7 @@ from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.hub.markdown import escaped
 from lerobot_wm.hub.model_card import IMAGINATION, TrainingData, model_card
 from lerobot_wm.pipeline.source import SourceConfig
+from lerobot_wm.policies.world_model_config import WorldModelConfig
 from lerobot_wm.report.imagination import animation, psnr_table
 from lerobot_wm.report.open_loop import load_world_model, open_loop
 from lerobot_wm.report.records import Record, find_records, read_records
@@ -97,7 +98,14 @@ def publish(cfg: PublishConfig) -> str:
         tables.append(psnr_table(predictions))
     results = "".join(map(_section, tables)) or None
     card = model_card(
-        get_policy_class(config.type), config, cfg.repo_id, run, _training_data(run), results, tasks
+        get_policy_class(config.type),
+        config,
+        cfg.repo_id,
+        run,
+        _training_data(run),
+        results,
+        tasks,
+        makes_latents=isinstance(config, WorldModelConfig),
     )
     files["README.md"] = str(card).encode()
     return _upload(files, cfg.repo_id, cfg.private)

@@ -4,7 +4,7 @@ import json
 import logging
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,15 @@ from torch import Tensor
 from lerobot_wm.constants import OBS_LATENT
 from lerobot_wm.data.check import check_dataset, damage_named
 from lerobot_wm.data.loader import RamLoader
+from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.hub.errors import check_can_push, check_dataset_version
 from lerobot_wm.pipeline.divergence import LossWatch
 from lerobot_wm.pipeline.encode import encode_to_cache
-from lerobot_wm.pipeline.processors import check_processors
+from lerobot_wm.pipeline.processors import check_policy_path, check_processors
+from lerobot_wm.pipeline.train_resume import clear_unfinished, how_to_go_on, restore_last, stops_explained
+from lerobot_wm.pipeline.training_run import check_run_settings, check_training_state
 from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.fits import check_dataset_fits
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
 TRAIN_LOG_NAME = "train_log.jsonl"
@@ -159,8 +163,15 @@ def encode_if_needed(cfg: TrainPipelineConfig) -> None:
 
     Args:
         cfg: Changed in place: its dataset becomes the encoded one.
+
+    Raises:
+        ValueError: The policy and the dataset do not fit; nothing was encoded.
     """
     policy = cfg.policy
+    if not isinstance(policy, ImagePolicyConfig):
+        return
+    meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
+    check_dataset_fits(policy, meta, cfg.rename_map)
     if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent:
         return
     encoder = policy.world_model_path
@@ -169,7 +180,6 @@ def encode_if_needed(cfg: TrainPipelineConfig) -> None:
         encoder = f"{policy.pretrained_path}{revision}"
     if encoder is None:
         return
-    meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
     if OBS_LATENT not in meta.features:
         encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device))
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
@@ -179,6 +189,12 @@ def encode_if_needed(cfg: TrainPipelineConfig) -> None:
 @parser.wrap()
 def train(cfg: TrainPipelineConfig) -> None:
     """Train any LeRobot policy as `lerobot-train` does, from the same flags, into the same checkpoints."""
+    if not cfg.resume and cfg.output_dir is not None and cfg.output_dir.exists():
+        # While another process is at work there, nothing is to be gone on with, or to be removed.
+        with sole_writer(cfg.output_dir):
+            raise FileExistsError(
+                f"{cfg.output_dir} is there already: choose another --output_dir, or {how_to_go_on(cfg.output_dir)}."
+            )
     cfg.validate()
     if cfg.policy is None:
         raise ValueError(
@@ -188,9 +204,21 @@ def train(cfg: TrainPipelineConfig) -> None:
         raise ValueError("--dataset.streaming=true reads no dataset into memory: use lerobot-train for it.")
     if cfg.policy.pretrained_path is not None:
         check_processors(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
+    if cfg.resume:
+        check_training_state(cfg.checkpoint_path)
     accelerator = make_accelerator(cfg)
     if cfg.policy.push_to_hub and accelerator.is_main_process:
         check_can_push(cfg.policy.repo_id)  # now, not when hours of training are over
+    with (
+        sole_writer(cfg.output_dir) if accelerator.is_main_process else nullcontext(),
+        stops_explained(cfg.output_dir),
+    ):
+        _train(cfg, accelerator)
+
+
+def _train(cfg: TrainPipelineConfig, accelerator: RamAccelerator) -> None:
+    if cfg.resume and accelerator.is_main_process:
+        clear_unfinished(cfg.checkpoint_path, cfg.output_dir)
     check_dataset(cfg.dataset.repo_id, cfg.dataset.root)
     check_dataset_version(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     with accelerator.in_turn():
@@ -206,4 +234,9 @@ def train(cfg: TrainPipelineConfig) -> None:
 
 def main() -> None:
     """Entry point of `lerobot-wm train`."""
+    config_path = parser.parse_arg("config_path")
+    if config_path is not None:
+        restore_last(config_path)
+        check_run_settings(config_path)
+    check_policy_path()
     train()

@@ -1,6 +1,8 @@
 """Training that goes on from a checkpoint, on the same dataset or another one."""
 
-from lerobot.configs import FeatureType
+from collections.abc import Iterable
+
+from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
@@ -24,19 +26,58 @@ def fit_to_dataset(
     Raises:
         ValueError: A size differs; names both.
     """
+    check_sizes(
+        saved,
+        (*saved.features_read, ACTION),
+        dataset_meta,
+        f"train it on with data of the same robot, or train anew with --policy.type={saved.type} in place of "
+        "--policy.path",
+    )
     features = dataset_to_policy_features(dataset_meta.features)
-    # A feature that the dataset has under another name (--rename_map) is not found here, nor are a latent dataset's
-    # cameras.
-    for key in (*saved.features_read, ACTION):
-        if key not in features:
-            continue
+    for key in set(saved.cameras) & features.keys():  # a latent dataset has none
+        config.input_features[key] = features[key]
+
+
+def check_sizes(
+    saved: ImagePolicyConfig, keys: Iterable[str], dataset_meta: LeRobotDatasetMetadata, mend: str
+) -> None:
+    """Refuse a dataset whose numbers are of other sizes than those a checkpoint was trained with.
+
+    A feature that the dataset lacks, or has under another name (--rename_map), is passed over, and so are images.
+
+    Args:
+        saved: The checkpoint's configuration.
+        keys: Of the features to compare.
+        dataset_meta: The dataset's.
+        mend: What to do, for the message.
+
+    Raises:
+        ValueError: A size differs; names both.
+    """
+    features = dataset_to_policy_features(dataset_meta.features)
+    for key in filter(features.__contains__, keys):
         known = (saved.output_features if key == ACTION else saved.input_features)[key]
         found = features[key]
         if known.type is not FeatureType.VISUAL and known.shape != found.shape:
             raise ValueError(
                 f"This {saved.type} was trained with '{key}' of size {known.shape[0]}, {dataset_meta.repo_id} has it "
-                f"with {found.shape[0]}: train it on with data of the same robot, or train anew with "
-                f"--policy.type={saved.type} in place of --policy.path."
+                f"with {found.shape[0]}: {mend}."
             )
-        if known.type is FeatureType.VISUAL:
-            config.input_features[key] = found
+
+
+def check_action_size(config: PreTrainedConfig, saved: PreTrainedConfig) -> None:
+    """Refuse an environment or robot with actions of another size than a checkpoint's.
+
+    Args:
+        config: The configuration to act with; LeRobot has given it the environment's actions.
+        saved: As it is in the checkpoint.
+
+    Raises:
+        ValueError: The sizes differ.
+    """
+    known, found = saved.output_features.get(ACTION), config.output_features.get(ACTION)
+    if known is not None and found is not None and tuple(known.shape) != tuple(found.shape):
+        raise ValueError(
+            f"This {saved.type} was trained with '{ACTION}' of size {known.shape[0]}, the robot or environment takes "
+            f"{found.shape[0]}: use the kind that its dataset was recorded on."
+        )

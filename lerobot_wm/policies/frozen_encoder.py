@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 
+from lerobot_wm.policies.checkpoint import read_config
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.world_model_config import WorldModelConfig
 
@@ -25,12 +25,12 @@ def load_encoder(path: str) -> EncoderPolicy:
             or commit.
 
     Raises:
-        ValueError: The checkpoint has no encoder.
+        ValueError, FileNotFoundError: The checkpoint has no encoder, or is damaged.
     """
     name, revision = path, None
     if "@" in path and not Path(path).is_dir():
         name, revision = path.rsplit("@", 1)
-    config = PreTrainedConfig.from_pretrained(name, revision=revision)
+    config = read_config(name, revision)
     holds_one = isinstance(config, LatentPolicyConfig) and config.use_latent
     if not holds_one and not isinstance(config, WorldModelConfig):
         raise ValueError(

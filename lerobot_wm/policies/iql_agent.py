@@ -56,25 +56,33 @@ class Outcomes(nn.Module):
 
     def __init__(self, config: IQLConfig, dataset_meta: LeRobotDatasetMetadata | None) -> None:
         super().__init__()
-        end = DONE
-        if dataset_meta is not None:
-            features, known = dataset_meta.features, reward_columns(dataset_meta)
-            end = DONE if DONE in features else SUCCESS
-            missing = [] if config.reward_key in known else [config.reward_key]
-            missing += [] if end in features else [f"{DONE} or {SUCCESS}"]
-            if missing:
-                choice = f"set --policy.reward_key to one of {', '.join(known)}, " if known else ""
-                raise ValueError(
-                    f"{config.type} learns from rewards, but {dataset_meta.repo_id} has no {' and no '.join(missing)}: "
-                    f"{choice}add what is missing to the dataset, or train "
-                    f"--policy.type={config.type.replace('iql', 'bc')}, which needs none."
-                )
+        end = DONE if dataset_meta is None else end_column(config, dataset_meta)
         self.reward = FrameLabel(config.reward_key, dataset_meta)
         self.end = FrameLabel(end, dataset_meta)
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Rewards (B,) and ends (B,) bool."""
         return self.reward(batch).flatten(), self.end(batch).flatten().bool()
+
+
+def end_column(config: IQLConfig, dataset_meta: LeRobotDatasetMetadata) -> str:
+    """The column that tells where a task ends; a dataset without it, or without the reward, is refused.
+
+    Raises:
+        ValueError: The dataset lacks the reward, or does not tell where a task ends.
+    """
+    features, known = dataset_meta.features, reward_columns(dataset_meta)
+    end = DONE if DONE in features else SUCCESS
+    missing = [] if config.reward_key in known else [config.reward_key]
+    missing += [] if end in features else [f"{DONE} or {SUCCESS}"]
+    if missing:
+        choice = f"set --policy.reward_key to one of {', '.join(known)}, " if known else ""
+        raise ValueError(
+            f"{config.type} learns from rewards, but {dataset_meta.repo_id} has no {' and no '.join(missing)}: "
+            f"{choice}add what is missing to the dataset, or train "
+            f"--policy.type={config.type.replace('iql', 'bc')}, which needs none."
+        )
+    return end
 
 
 def batch_loss(

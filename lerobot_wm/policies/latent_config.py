@@ -1,5 +1,6 @@
 """What the configurations of the policies on world-model latents share."""
 
+from collections.abc import Container
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -87,6 +88,18 @@ class LatentPolicyConfig(ImagePolicyConfig, MultiTaskConfig):
     def scales_latents(self) -> bool:
         """Whether the policy scales its latents by the dataset's statistics."""
         return self.world_model is not None and self.world_model.scales_latents
+
+    def check_environment_state(self, shown: Container[str]) -> None:
+        """Refuse an environment that does not emit the full state which the policy reads.
+
+        Raises:
+            ValueError: It is missing among what is `shown`.
+        """
+        if self.use_environment_state and OBS_ENV_STATE not in shown:
+            raise ValueError(
+                f"This policy reads '{OBS_ENV_STATE}', which the environment does not emit: evaluate it with "
+                "--env.environment_state=true (metaworld_mt), or train one without --policy.use_environment_state."
+            )
 
     @property
     def observation_dim(self) -> int:

@@ -184,9 +184,5 @@ class LatentPolicy(MultiTaskPolicy):
         return (255 * grid).round().byte()[None, :, None]
 
     def _env_state(self, batch: dict[str, Any]) -> Tensor:
-        if OBS_ENV_STATE not in batch:
-            raise ValueError(
-                f"This policy reads '{OBS_ENV_STATE}', which the environment does not emit: evaluate it with "
-                "--env.environment_state=true (metaworld_mt), or train one without --policy.use_environment_state."
-            )
+        self.config.check_environment_state(batch)
         return batch[OBS_ENV_STATE]

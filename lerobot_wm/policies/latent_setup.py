@@ -8,7 +8,7 @@ from lerobot.policies.factory import get_policy_class
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.data.fingerprint import weights_fingerprint
-from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
 from lerobot_wm.policies.features import stat
 from lerobot_wm.policies.frozen_encoder import load_encoder
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
@@ -70,6 +70,13 @@ def check_latents(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetada
             "which does so by itself."
         )
     record = LatentRecord.read(Path(dataset_meta.root))
+    tasks = [str(task) for task in dataset_meta.tasks.index]
+    if record.tasks != tasks:
+        raise ValueError(
+            f"{Path(dataset_meta.root) / RECORD_PATH} tells of latents of the tasks {record.tasks}, but "
+            f"{dataset_meta.repo_id} has {tasks}: it is another dataset's or revision's. Encode "
+            f"{record.source_repo_id} again."
+        )
     record.check_world_model(config.world_model_fingerprint, config.world_model_path)
     for key, shape in record.camera_shapes.items():
         config.input_features[key] = PolicyFeature(FeatureType.VISUAL, tuple(shape))

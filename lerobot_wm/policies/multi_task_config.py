@@ -1,5 +1,6 @@
 """What the configurations of all policies that act have in common."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from lerobot.optim import LRSchedulerConfig
@@ -48,6 +49,19 @@ class MultiTaskConfig(SingleFramesConfig):
     def action_dim(self) -> int:
         """Size of the action."""
         return feature_dim(self.output_features, ACTION, "The dataset")
+
+    def check_tasks(self, names: Iterable[str]) -> None:
+        """Refuse tasks that the policy was not trained on.
+
+        Raises:
+            ValueError: A task string is not one of its own; names both.
+        """
+        unknown = set(names) - set(self.tasks)
+        if unknown:
+            raise ValueError(
+                f"Unknown task {sorted(unknown)}; this policy was trained on {self.tasks}. Use one of these strings, "
+                "or train it on, by --policy.path, with a dataset that holds the new task."
+            )
 
     def get_optimizer_preset(self) -> FusedAdamConfig:
         """Adam without clipping (IQL reference implementation)."""

@@ -112,17 +112,12 @@ class MultiTaskPolicy(StrictPolicy):
         known = self.config.tasks
         given = batch.get(TASK) or [""] * batch_size  # lerobot-rollout gives "" where it was given none
         names = [known[0]] * batch_size if len(known) == 1 else given
-        unknown = set(names) - set(known)
-        if "" in unknown:
+        if "" in set(names) - set(known):
             raise ValueError(
                 f"The batch has no '{TASK}' strings; this policy knows {len(known)} tasks: {known}. Name one of them, "
                 "letter by letter (by --task for lerobot-rollout)."
             )
-        if unknown:
-            raise ValueError(
-                f"Unknown task {sorted(unknown)}; this policy was trained on {known}. Use one of these strings, or "
-                "train it on, by --policy.path, with a dataset that holds the new task."
-            )
+        self.config.check_tasks(names)
         index = torch.tensor([known.index(name) for name in names], device=self.state_scaling.offset.device)
         return nn.functional.one_hot(index, len(known)).float()
 

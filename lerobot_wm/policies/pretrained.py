@@ -1,6 +1,7 @@
 """Strict loading of checkpoints."""
 
 from copy import deepcopy
+from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -12,7 +13,12 @@ from lerobot.policies import PreTrainedPolicy
 from safetensors import SafetensorError
 
 from lerobot_wm.hub.model_card import TrainingData, model_card
-from lerobot_wm.policies.fine_tuning import fit_to_dataset
+from lerobot_wm.policies.checkpoint import WHOLE, not_finite, read_config
+from lerobot_wm.policies.fine_tuning import check_action_size, fit_to_dataset
+from lerobot_wm.policies.world_model_config import WorldModelConfig
+
+# What `from_pretrained` is told of the Hub, for each file.
+_HUB_OPTIONS = ("revision", "token", "cache_dir", "force_download", "local_files_only")
 
 
 class StrictPolicy(PreTrainedPolicy):
@@ -45,18 +51,30 @@ class StrictPolicy(PreTrainedPolicy):
             **kwargs: LeRobot's, such as `revision`.
 
         Raises:
-            ValueError: Keys are missing, left over or of another shape, weights are not finite, or the dataset's
-                sizes are not the checkpoint's.
+            FileNotFoundError: The configuration or the weights are missing.
+            ValueError: The checkpoint is of another type, its configuration is not one of this release, keys are
+                missing, left over or of another shape, weights are not finite, or the sizes of the dataset or
+                environment are not the checkpoint's.
         """
-        if dataset_meta is not None:
-            saved = PreTrainedConfig.from_pretrained(pretrained_name_or_path, revision=kwargs.get("revision"))
-            config = config or deepcopy(saved)
+        hub = {name: kwargs[name] for name in _HUB_OPTIONS if name in kwargs}
+        saved = read_config(pretrained_name_or_path, **hub)
+        if not isinstance(saved, cls.config_class):
+            raise ValueError(
+                f"{pretrained_name_or_path} is a {saved.type}, no {cls.name}: give a checkpoint of {cls.name}, or load "
+                f"it as what it is, --policy.type={saved.type}."
+            )
+        config = config or deepcopy(saved)
+        if dataset_meta is None:
+            check_action_size(config, saved)
+        else:
             fit_to_dataset(config, saved, dataset_meta)
             kwargs["dataset_meta"] = dataset_meta
         return super().from_pretrained(pretrained_name_or_path, config=config, strict=strict, **kwargs)
 
     @classmethod
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
+        if not Path(model_file).is_file():
+            raise FileNotFoundError(f"{model_file} is missing, the weights of the checkpoint: {WHOLE}.")
         try:
             model = super()._load_as_safetensor(model, model_file, map_location, strict)
         except (RuntimeError, SafetensorError) as error:
@@ -66,10 +84,7 @@ class StrictPolicy(PreTrainedPolicy):
             ) from error
         bad = [name for name, tensor in model.state_dict().items() if not torch.isfinite(tensor).all()]
         if bad:
-            raise ValueError(
-                f"{model_file} holds NaN or Inf in {', '.join(bad[:3])}{' ...' if len(bad) > 3 else ''}: "
-                "the training that wrote it diverged; take an earlier checkpoint."
-            )
+            raise ValueError(f"{model_file} {not_finite(bad)}")
         return model
 
     def generate_model_card(
@@ -83,4 +98,6 @@ class StrictPolicy(PreTrainedPolicy):
     ) -> ModelCard:
         """The card that LeRobot publishes with a policy it has trained; its last two arguments tell all."""
         data = None if dataset_meta is None else TrainingData.of(dataset_meta)
-        return model_card(type(self), self.config, self.config.repo_id or model_type, cfg, data)
+        repo_id = self.config.repo_id or model_type
+        makes_latents = isinstance(self.config, WorldModelConfig)
+        return model_card(type(self), self.config, repo_id, cfg, data, makes_latents=makes_latents)

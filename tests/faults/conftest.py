@@ -1,12 +1,14 @@
 """A small dataset of several files and cameras, to be broken."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from tests.faults.running import Commands, Inputs, make_inputs
 from tests.recording import camera, vector
 
 FPS = 10
@@ -55,3 +57,17 @@ def whole_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dataset(whole_dataset: Path, tmp_path: Path) -> Path:
     """A copy of it, to be broken."""
     return shutil.copytree(whole_dataset, tmp_path / "dataset")
+
+
+@pytest.fixture(scope="session")
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Commands]:
+    """Commands in processes of their own."""
+    commands = Commands(tmp_path_factory.mktemp("printed"))
+    yield commands
+    commands.close()
+
+
+@pytest.fixture(scope="session")
+def inputs(processes: Commands, tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    """What commands read; not to be changed."""
+    return make_inputs(processes, tmp_path_factory.mktemp("inputs"))

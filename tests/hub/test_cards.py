@@ -60,7 +60,8 @@ def test_no_name_breaks_a_card() -> None:
     config.output_features = features("ACTION", "action", (4,))
     run = TrainPipelineConfig(dataset=DatasetConfig(repo_id="user/x"), policy=config)
     data = TrainingData("user/x", 2, 100, NASTY, "0123456789abcdef", None)
-    card = model_card(get_policy_class("wm_rssm"), config, "user/wm", run, data, imagined_tasks=NASTY)
+    policy_class = get_policy_class("wm_rssm")
+    card = model_card(policy_class, config, "user/wm", run, data, imagined_tasks=NASTY, makes_latents=True)
     again = ModelCard(str(card))
     assert again.data.license == "apache-2.0"
     shown = html(again.text)

@@ -36,6 +36,11 @@ class FrozenBackboneConfig(WorldModelConfig):
         """None: features depend on one image."""
         return None
 
+    @property
+    def features_read(self) -> list[str]:
+        """Cameras alone."""
+        return self.cameras
+
     def validate_features(self) -> None:
         """Choose the cameras and the image size.
 

@@ -1,0 +1,135 @@
+"""Going on with a training that was killed, perhaps while it wrote a checkpoint.
+
+LeRobot writes a checkpoint's files one by one into its folder, the state of the optimizer or, where there is one, of
+the scheduler last; then it removes the link `last` and sets it again. A kill leaves at most one folder that is not
+whole, later than the one that `last` names, or no link.
+"""
+
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from lerobot.common.train_utils import load_training_step
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import (
+    CHECKPOINTS_DIR,
+    LAST_CHECKPOINT_LINK,
+    OPTIMIZER_PARAM_GROUPS,
+    PRETRAINED_MODEL_DIR,
+    SCHEDULER_STATE,
+    TRAINING_STATE_DIR,
+)
+
+from lerobot_wm.pipeline.errors import disk_problem
+
+logger = logging.getLogger(__name__)
+
+
+def restore_last(config_path: str) -> None:
+    """Set `checkpoints/last` again where a kill fell between its removal and its setting.
+
+    Args:
+        config_path: What training is to go on from; nothing is done unless it leads through a `checkpoints/last`.
+
+    Raises:
+        FileNotFoundError: There is no such link, and no checkpoint that it could name.
+    """
+    path = Path(config_path)
+    for link in (path, *path.parents):
+        if (link.parent.name, link.name) == (CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK) and not _is_set(link):
+            raise FileNotFoundError(
+                f"{link} is missing, and there is no whole checkpoint beside it: a training that was killed before its "
+                f"first begins again, without --resume; remove {link.parent.parent} before that."
+            )
+
+
+def clear_unfinished(checkpoint: Path, output_dir: Path) -> None:
+    """Remove what a killed run left of a checkpoint; refuse where training would write over finished ones.
+
+    Args:
+        checkpoint: What training goes on from.
+        output_dir: Where it writes.
+
+    Raises:
+        FileNotFoundError: The checkpoint itself is not whole.
+        FileExistsError: The folder holds later checkpoints, up to that which `last` names.
+    """
+    if not is_whole(checkpoint):
+        raise FileNotFoundError(
+            f"{checkpoint} does not hold all of a training's state: it was being written when a run was killed, or "
+            f"files of it were removed. Go on from {checkpoint.with_name(LAST_CHECKPOINT_LINK)}."
+        )
+    folder = output_dir / CHECKPOINTS_DIR
+    last = folder / LAST_CHECKPOINT_LINK
+    step = load_training_step(checkpoint / TRAINING_STATE_DIR)
+    finished = load_training_step(last / TRAINING_STATE_DIR) if _is_set(last) else 0
+    later = [saved for saved in _numbered(folder) if int(saved.name) > step]
+    kept = [saved.name for saved in later if int(saved.name) <= finished]
+    if kept:
+        raise FileExistsError(
+            f"{folder} holds later checkpoints, {', '.join(kept)}, which training on from step {step} would write "
+            f"over: go on from {last}, give another --output_dir, or remove them."
+        )
+    for saved in later:
+        shutil.rmtree(saved)
+
+
+def how_to_go_on(output_dir: Path) -> str:
+    """What to do about a training that stopped early, as the end of a sentence."""
+    last = output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK
+    if not _is_set(last):
+        return f"there is no checkpoint yet: remove {output_dir} and give the same command again"
+    settings = last / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
+    return f"go on with `lerobot-wm train --config_path={settings} --resume=true`"
+
+
+@contextmanager
+def stops_explained(output_dir: Path) -> Iterator[None]:
+    """Have Ctrl-C, and a disk that takes no more, say how the training in a folder goes on.
+
+    Raises:
+        KeyboardInterrupt: On Ctrl-C.
+        OSError: The disk refused to be written.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(how_to_go_on(output_dir)) from None
+    except Exception as error:
+        problem = disk_problem(error)
+        if problem is None:
+            raise
+        raise OSError(f"{problem}; then {how_to_go_on(output_dir)}.") from error
+
+
+def is_whole(checkpoint: Path) -> bool:
+    """Whether the file that LeRobot writes last into a checkpoint is there, and whole."""
+    try:
+        config = json.loads((checkpoint / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).read_text())
+        written_last = SCHEDULER_STATE if config["scheduler"] is not None else OPTIMIZER_PARAM_GROUPS
+        json.loads((checkpoint / TRAINING_STATE_DIR / written_last).read_text())
+    except (OSError, ValueError, KeyError):
+        return False
+    return True
+
+
+def _numbered(checkpoints: Path) -> list[Path]:
+    """Folders of checkpoints, earliest first."""
+    return sorted((path for path in checkpoints.glob("*") if path.name.isdigit()), key=lambda p: int(p.name))
+
+
+def _is_set(last: Path) -> bool:
+    """Whether the link names a checkpoint; where it does not, it is set to the newest whole one, if there is any."""
+    if last.exists():
+        return True
+    whole = [checkpoint for checkpoint in _numbered(last.parent) if is_whole(checkpoint)]
+    if not whole:
+        return False
+    last.unlink(missing_ok=True)  # it may name what is no longer there
+    with suppress(FileExistsError):  # another process of this training was faster
+        last.symlink_to(whole[-1].name)
+    logger.warning("%s was missing, as a kill can leave it: it is %s now.", last, whole[-1].name)
+    return True

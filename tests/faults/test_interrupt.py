@@ -1,0 +1,92 @@
+"""Ctrl-C: one line that says how to go on, no traceback, no process left, and the same command goes on."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+from lerobot.utils.io_utils import load_json
+
+from lerobot_wm.data.check import check_dataset
+from lerobot_wm.report.records import read_records
+from tests.faults.running import Commands, Ended, Inputs
+
+AGAIN = "interrupted; the same command goes on where it was, or begins again."
+TRAINED = "training_state/training_step.json"
+
+
+def check_interrupted(ended: Ended) -> None:
+    assert ended.code == 130, ended.printed
+    assert "Traceback" not in ended.printed
+    assert "interrupted" in ended.last_line
+
+
+@pytest.mark.parametrize("name", ["collect", "encode", "eval"])
+def test_the_same_command_goes_on(name: str, processes: Commands, inputs: Inputs, tmp_path: Path) -> None:
+    output = tmp_path / "output"
+    begun = {"collect": "output.shards/unfinished-*/*", "encode": "output.parts", "eval": "output/*.part"}[
+        name
+    ]
+    result = {"collect": "meta/info.json", "encode": "meta/info.json", "eval": "records.jsonl"}[name]
+    command = inputs.command(name, output)
+    ended = processes.start(command).interrupt_when(lambda: list(tmp_path.glob(begun)))
+    check_interrupted(ended)
+    assert ended.last_line == f"lerobot-wm {name}: {AGAIN}"
+    assert not (output / result).exists()
+    assert not list(tmp_path.glob(".*")), "the lock is gone"
+
+    again = processes.run(command)
+    assert again.code == 0, again.printed
+    if name == "eval":
+        assert [record["variation"] for record in read_records([output / result])] == [0, 1]
+        assert not list(output.glob("*.part"))
+    else:
+        check_dataset("a/b", output)
+        assert {path.name for path in tmp_path.iterdir()} <= {"output", "output.cache"}
+
+
+def test_training_says_how_to_go_on(processes: Commands, inputs: Inputs, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    last = run / "checkpoints" / "last"
+    work = processes.start(inputs.command("train", run), "--steps=100000")
+    ended = work.interrupt_when(last.exists)
+    check_interrupted(ended)
+    _, advice, _ = ended.last_line.split("`")
+    assert advice == (
+        f"lerobot-wm train --config_path={last}/pretrained_model/train_config.json --resume=true"
+    )
+    step = load_json(last / TRAINED)["step"]
+    again = processes.run(advice.removeprefix("lerobot-wm "), f"--steps={step + 2}")
+    assert again.code == 0, again.printed
+    assert load_json(last / TRAINED)["step"] == step + 2
+
+
+def test_before_the_first_checkpoint(processes: Commands, inputs: Inputs, tmp_path: Path) -> None:
+    command = f"{inputs.command('train', tmp_path / 'run')} --steps=100000 --save_freq=50000"
+    ended = processes.start(command).interrupt_when((tmp_path / "run" / "train_log.jsonl").exists)
+    check_interrupted(ended)
+    advice = f"there is no checkpoint yet: remove {tmp_path / 'run'} and give the same command again."
+    assert ended.last_line == f"lerobot-wm train: interrupted; {advice}"
+    refused = processes.run(command)
+    assert refused.code == 1
+    assert "is there already: choose another --output_dir, or there is no checkpoint yet" in refused.last_line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "flags", "begun"),
+    [
+        ("collect", "--tasks=reach-v3,window-close-v3 --num_workers=2", "output.shards/unfinished-*/*"),
+        ("eval", "--env.task=reach-v3,window-close-v3 --num_workers=2", "output/*.part"),
+    ],
+)
+def test_workers_end_too(
+    name: str, flags: str, begun: str, processes: Commands, inputs: Inputs, tmp_path: Path
+) -> None:
+    words = shlex.split(inputs.command(name, tmp_path / "output"))
+    given = {flag.split("=")[0] for flag in flags.split()}
+    command = " ".join([word for word in words if word.split("=")[0] not in given]) + f" {flags}"
+    ended = processes.start(command).interrupt_when(lambda: list(tmp_path.glob(begun)))
+    check_interrupted(ended)
+    assert not list(tmp_path.glob("output.shards/[!u]*")), "no worker finished what it had begun"
+    again = processes.run(command)
+    assert again.code == 0, again.printed

@@ -1,0 +1,53 @@
+"""A machine without OpenGL to draw with."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.faults.running import Inputs
+
+MEND = "apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri and use MUJOCO_GL=egl"
+# EGL is there, and finds nothing to draw on.
+NO_DRIVER = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json"}
+COMMAND = (sys.executable, "-m", "lerobot_wm.cli")
+# In a mount namespace of its own: the library is there, and holds nothing.
+WITHOUT_EGL = """
+for file in $(ldconfig -p | grep -o "/.*libEGL.so.*"); do mount --bind /dev/null $(readlink -f $file); done
+exec "$@"
+"""
+
+
+def check_refused(words: list[str], backend: str, output: Path, **environment: str) -> None:
+    """Run a command in a process that is new: mujoco looks for its backend while it is imported."""
+    env = {**os.environ, "MUJOCO_GL": backend, **environment}
+    run = subprocess.run(words, env=env, capture_output=True, text=True)
+    if "unshare failed" in run.stderr:
+        pytest.skip("no library can be hidden here: that takes root")
+    assert run.returncode == 1
+    assert "Traceback" not in run.stderr
+    line = run.stderr.splitlines()[-1]
+    assert f": No headless OpenGL to draw with (MUJOCO_GL={backend})." in line
+    assert MEND in line
+    assert not list(output.glob("*"))
+
+
+@pytest.mark.parametrize("fault", ["no library", "no driver", "no such backend"])
+def test_collect(fault: str, tmp_path: Path) -> None:
+    flags = "--tasks=reach-v3 --episodes_per_task=1 --num_workers=1 --repo_id=a/b"
+    words = [*COMMAND, "collect", *flags.split(), f"--root={tmp_path / 'output'}"]
+    match fault:
+        case "no library":
+            hidden = ["unshare", "--mount", "bash", "-c", WITHOUT_EGL, "bash", *words]
+            check_refused(hidden, "egl", tmp_path / "output")
+        case "no driver":
+            check_refused(words, "egl", tmp_path / "output", **NO_DRIVER)
+        case _:
+            check_refused(words, "bogus", tmp_path / "output")
+
+
+def test_eval(inputs: Inputs, tmp_path: Path) -> None:
+    words = [*COMMAND, *inputs.command("eval", tmp_path / "output").split()]
+    check_refused(words, "egl", tmp_path / "output" / "videos", **NO_DRIVER)

@@ -1,0 +1,226 @@
+"""What does not fit together is said before an image is decoded, an environment is built or training begins."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wm.data.latents import RECORD_PATH
+from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
+from lerobot_wm.pipeline.encode import encode
+from tests.faults.breakage import set_entry
+from tests.faults.checkpoints import TASKS, WEIGHTS, last_line, load, make_checkpoint, record_demos
+from tests.flags import TRAIN_FLAGS
+from tests.recording import camera, vector
+
+WRIST = "observation.images.wrist"
+# What is unlike the demonstrations -> features that are changed.
+UNLIKE = {
+    "actions": {"action": vector(7)},
+    "states": {"observation.state": vector(9)},
+    "cameras": {"observation.image": None, WRIST: camera(64, 64)},
+    "rewards": {"next.reward": None, "next.done": None},
+    "no_actions": {"action": None, "observation.other": vector(4)},
+}
+TRAIN = f"train {TRAIN_FLAGS} --steps=1 --batch_size=2 --output_dir={{out}} {{data}} "
+GO_ON, NEW_BC = TRAIN + "--policy.path={%s}", TRAIN + "--policy.type=wm_bc --policy.world_model_path={%s}"
+ENCODE = "encode --device=cpu --output_repo_id=a/b --output_root={out} {data} --world_model_path={%s}"
+EVAL = "eval --policy.device=cpu --env.type=metaworld_mt --eval.n_episodes=1 --output_dir={out} --policy.path={%s} "
+
+# Dataset, command, what the line says.
+CASES = [
+    (
+        "actions",
+        GO_ON % "wm_rssm",
+        "This wm_rssm was trained with 'action' of size 4, test/actions has it with 7: ",
+    ),
+    (
+        "actions",
+        GO_ON % "wm_bc",
+        "This wm_bc was trained with 'action' of size 4, test/actions has it with 7: ",
+    ),
+    (
+        "actions",
+        NEW_BC % "wm_rssm",
+        "This wm_rssm was trained with 'action' of size 4, test/actions has it with 7: e",
+    ),
+    (
+        "actions",
+        ENCODE % "wm_bc",
+        "This wm_rssm was trained with 'action' of size 4, test/actions has it with 7: enc",
+    ),
+    (
+        "states",
+        GO_ON % "wm_bc",
+        "This wm_bc was trained with 'observation.state' of size 4, test/states has it wi",
+    ),
+    (
+        "states",
+        ENCODE % "proprio",
+        "This wm_rssm was trained with 'observation.state' of size 4, test/states has it",
+    ),
+    ("no_actions", ENCODE % "wm_rssm", "test/no_actions has no action, which the world model reads; it has "),
+    (
+        "cameras",
+        GO_ON % "e2e_bc",
+        f"This e2e_bc sees observation.image; test/cameras has the cameras {WRIST}: use",
+    ),
+    (
+        "cameras",
+        GO_ON % "wm_bc",
+        f"This wm_bc sees observation.image; test/cameras has the cameras {WRIST}: use one",
+    ),
+    (
+        "cameras",
+        ENCODE % "wm_rssm",
+        f"The world model watches observation.image; test/cameras has the cameras {WRIST}",
+    ),
+    (
+        "rewards",
+        TRAIN + "--policy.type=wm_iql --policy.world_model_path={wm_rssm}",
+        "wm_iql learns from rewards, but test/rewards has no next.reward and no next.done or next.success: add",
+    ),
+    ("rewards", GO_ON % "e2e_iql", "e2e_iql learns from rewards, but test/rewards has no next.reward"),
+    ("demos", TRAIN + "--policy.type=wm_bc", "--policy.type=wm_bc needs --policy.world_model_path="),
+    ("latents", NEW_BC % "another", "These latents were encoded by world model "),
+    ("latents of other tasks", NEW_BC % "wm_rssm", "tells of latents of the tasks "),
+    (
+        "latents",
+        ENCODE % "wm_rssm",
+        "The world model watches observation.image; test/latents has the cameras none: use",
+    ),
+    (
+        "",
+        EVAL % "wm_bc" + "--env.task=reach-v3 --env.image_size=32",
+        "'observation.image' is (3, 32, 32), this policy was",
+    ),
+    (
+        "",
+        EVAL % "e2e_bc" + "--env.task=reach-v3 --env.camera_name=corner2,topview",
+        "This e2e_bc sees observation.image; --env.type=metaworld_mt --env.camera_name=corner2,topview has the cameras",
+    ),
+    (
+        "",
+        EVAL % "wm_bc" + "--env.task=mt6",
+        f"'Push and open a window']; this policy was trained on {list(TASKS)}. ",
+    ),
+    (
+        "",
+        EVAL % "oracle" + "--env.task=reach-v3",
+        "This policy reads 'observation.environment_state', which the env",
+    ),
+    (
+        "",
+        EVAL % "wm_rssm" + "--env.task=reach-v3",
+        "(wm_rssm) makes latents and chooses no actions: train a policy",
+    ),
+    (
+        "",
+        EVAL % "states_bc" + "--env.task=reach-v3",
+        "'observation.state' has 4 numbers, this policy was trained on 9",
+    ),
+    (
+        "",
+        EVAL % "actions_bc" + "--env.task=reach-v3",
+        "'action' of size 7, the robot or environment takes 4: use the",
+    ),
+    (
+        "",
+        EVAL % "one_task_less" + "--env.task=reach-v3",
+        f"{WEIGHTS} does not fit a e2e_bc of its config.json: ",
+    ),
+    (
+        "",
+        (EVAL % "wm_bc").replace("--policy.path=", "--policy.type=wm_bc --policy.world_model_path=")
+        + "--env.task=reach-v3",
+        "--policy.type=wm_bc alone would be untrained: give --policy.path=",
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LeRobotDataset]:
+    """The demonstrations, and datasets that are unlike them, by name."""
+    root = tmp_path_factory.mktemp("datasets")
+    return {name: record_demos(root / name, **changes) for name, changes in {"demos": {}, **UNLIKE}.items()}
+
+
+@pytest.fixture(scope="module")
+def paths(datasets: dict[str, LeRobotDataset], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Checkpoints and latents by name."""
+    root, demos = tmp_path_factory.mktemp("paths"), datasets["demos"]
+    paths = {name: make_checkpoint(name, root / name, demos) for name in ("wm_rssm", "e2e_bc", "e2e_iql")}
+    paths["another"] = make_checkpoint("wm_rssm", root / "another", demos, seed=1)
+    paths["proprio"] = make_checkpoint("wm_rssm", root / "proprio", demos, use_proprio=True)
+    paths["latents"] = root / "latents"
+    latents = encode(load(paths["wm_rssm"], "wm_rssm"), demos, "test/latents", paths["latents"])
+    paths["wm_bc"] = make_checkpoint("wm_bc", root / "wm_bc", latents, world_model_path=str(paths["wm_rssm"]))
+    for name in ("actions", "states"):
+        paths[f"{name}_bc"] = make_checkpoint("e2e_bc", root / f"{name}_bc", datasets[name])
+    paths["oracle"] = shutil.copytree(paths["wm_bc"], root / "oracle")
+    set_entry(paths["oracle"], "config.json", ["use_environment_state"], True)
+    paths["one_task_less"] = shutil.copytree(paths["e2e_bc"], root / "one_task_less")
+    set_entry(paths["one_task_less"], "config.json", ["tasks"], [TASKS[0]])
+    paths["latents of other tasks"] = shutil.copytree(paths["latents"], root / "other")
+    set_entry(paths["latents of other tasks"], str(RECORD_PATH), ["tasks"], [*reversed(TASKS)])
+    return paths
+
+
+@pytest.mark.parametrize(
+    ("data", "command", "says"), CASES, ids=[f"{data or 'eval'}-{i}" for i, (data, _, _) in enumerate(CASES)]
+)
+def test_is_refused(
+    data: str,
+    command: str,
+    says: str,
+    datasets: dict[str, LeRobotDataset],
+    paths: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        MetaworldMTEnvConfig, "create_envs", lambda *_, **__: pytest.fail("environments were built")
+    )
+    root = Path(datasets[data].root) if data in datasets else paths.get(data, tmp_path)
+    cache = root.with_name(f"{root.name}.cache")
+    before = set(cache.rglob("*"))
+    flags = f"--dataset.repo_id=test/{root.name} --dataset.root={root}"
+    assert says in last_line(command.format(data=flags, out=tmp_path / "out", **paths))
+    assert set(cache.rglob("*")) == before, "images were decoded first"
+    assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+def test_the_order_of_tasks_is_the_checkpoints(
+    paths: dict[str, Path],
+    datasets: dict[str, LeRobotDataset],
+    tmp_path: Path,
+    lerobot_wm_command: Callable[..., None],
+) -> None:
+    demos = datasets["demos"]
+    root = shutil.copytree(demos.root, tmp_path / "demos")
+    swapped = LeRobotDataset(demos.repo_id, root=root)
+    swapped.meta.tasks.index = swapped.meta.tasks.index[::-1]
+    policy = type(load(paths["e2e_bc"], "e2e_bc")).from_pretrained(paths["e2e_bc"], dataset_meta=swapped.meta)
+    assert policy.config.tasks == list(TASKS) == list(reversed(swapped.meta.tasks.index))
+
+
+def test_latents_of_a_changed_dataset_are_made_anew(
+    paths: dict[str, Path],
+    datasets: dict[str, LeRobotDataset],
+    tmp_path: Path,
+    lerobot_wm_command: Callable[..., None],
+) -> None:
+    root = shutil.copytree(datasets["demos"].root, tmp_path / "demos")
+    for _ in range(2):
+        lerobot_wm_command(
+            (NEW_BC % "wm_rssm").format(
+                data=f"--dataset.repo_id=test/demos --dataset.root={root}", out=tmp_path / "out", **paths
+            )
+        )
+        shutil.rmtree(tmp_path / "out")
+        info = json.loads((root / "meta" / "info.json").read_text())  # another revision: any byte of it
+        (root / "meta" / "info.json").write_text(json.dumps(info, indent=1))
+    assert len(list((tmp_path / "demos.cache").glob("latents-*"))) == 2
