@@ -33,7 +33,7 @@ def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> 
     names = [f".{output.name}.lock"]
     if job is not None:
         names.append(f".{output.name}.{job}.lock")
-    # Jobs share the lock of the whole; each holds its own alone.
+    # Jobs share the lock of the whole, for which filelock has no kind; each holds its own alone.
     locks = {f".{output.name}.lock": fcntl.LOCK_EX if job is None else fcntl.LOCK_SH}
     if job is not None:
         locks[f".{output.name}.{job}.lock"] = fcntl.LOCK_EX

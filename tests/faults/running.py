@@ -61,7 +61,8 @@ class Running:
     def wait(self) -> Ended:
         """Wait for its end, and for that of its workers."""
         code = self._ask({"wait": self._pid})
-        wait_until(lambda: not processes_of(self._pid), seconds=60.0)  # an import server takes seconds to end
+        # The server that workers are forked from ends after its parent, each with seconds of tidying up.
+        wait_until(lambda: not processes_of(self._pid))
         return Ended(code, self._output.read_text())
 
 
