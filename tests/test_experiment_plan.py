@@ -19,7 +19,7 @@ from lerobot_wm.experiment.preset import load_preset, select_runs
 from lerobot_wm.experiment.report import report_command
 from lerobot_wm.experiment.stage import Stage, in_order, unfinished
 from lerobot_wm.pipeline.collect import CollectConfig
-from lerobot_wm.pipeline.encode import EncodeConfig
+from lerobot_wm.pipeline.encode_config import EncodeConfig
 from lerobot_wm.pipeline.eval_config import EvaluateConfig
 from lerobot_wm.pipeline.expert import ExpertConfig
 from lerobot_wm.pipeline.init import InitConfig

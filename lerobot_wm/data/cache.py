@@ -75,7 +75,8 @@ class CameraCache:
             name = f"{key}-{size[0]}x{size[1]}"
             height, width = size
         shape = (dataset.meta.total_frames, height, width, channels)
-        self._frames = self._open(folder / f"{name}.npy", shape)
+        self._path = folder / f"{name}.npy"
+        self._frames = self._open(self._path, shape)
         self._decoded = self._open(folder / f"{name}.decoded.npy", (dataset.meta.total_episodes,))
 
     @property
@@ -113,6 +114,7 @@ class CameraCache:
         row = self._dataset.meta.episodes[episode]
         size = self._frames.shape[1:3]
         position = row["dataset_from_index"]
+        self._reserve(position, row["length"])
         try:
             for images in self._images(row):
                 if images.shape[-2:] != size:
@@ -126,6 +128,19 @@ class CameraCache:
             ) from error
         self._frames.flush()
         self._decoded[episode] = 1
+
+    def _reserve(self, position: int, length: int) -> None:
+        """Have the disk set aside the place of an episode: others may have filled it since there was room for all."""
+        if not hasattr(os, "posix_fallocate"):  # macOS
+            return
+        frame_bytes = self._frames[0].nbytes
+        start = self._frames.offset + position * frame_bytes
+        with self._path.open("r+b") as file:
+            try:
+                os.posix_fallocate(file.fileno(), start, length * frame_bytes)
+            except OSError as error:
+                error.filename = str(self._path)  # which the system does not know
+                raise
 
     def _file(self, episode: int) -> Path:
         meta, root = self._dataset.meta, Path(self._dataset.root)

@@ -8,13 +8,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lerobot_wm.pipeline.collect_shards import Shard, write_shard
-from lerobot_wm.pipeline.errors import (
-    end_with_parent,
-    explained_to_parent,
-    interrupts_held,
-    workers_interrupted,
-)
+from lerobot_wm.pipeline.errors import explained_to_parent
 from lerobot_wm.pipeline.quiet import silence
+from lerobot_wm.pipeline.workers import end_with_parent, interrupts_held, workers_interrupted
 
 
 def write_missing_shards(shards: list[Shard], folder: Path, num_workers: int) -> None:

@@ -5,7 +5,7 @@ A frozen image backbone may stand in its place: its latents are the pooled featu
 
 import logging
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import draccus
@@ -24,51 +24,16 @@ from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.hub.dataset_card import license_of, push_latents
 from lerobot_wm.hub.errors import check_can_push
+from lerobot_wm.pipeline.encode_config import EncodeConfig
 from lerobot_wm.pipeline.encode_episodes import episode_batches
 from lerobot_wm.pipeline.encode_parts import LatentParts
 from lerobot_wm.pipeline.quiet import quiet
 from lerobot_wm.pipeline.share import Share, refuse_difference
-from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.policies.fits import check_encoder_fits
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_encoder import EncoderPolicy, load_encoder
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass
-class EncodeConfig:
-    """Flags of `lerobot-wm encode`.
-
-    Args:
-        world_model_path: Folder or Hub id (user/name or user/name@revision) of a wm_rssm or frozen_backbone checkpoint,
-            or of a policy on latents, which has its own in it.
-        dataset: The image dataset.
-        output_repo_id: Repository id of the latent dataset.
-        output_root: Its folder; must not exist yet.
-        sample: Store a sample of z_t instead of its mean.
-        seed: Seed of the samples.
-        device: Where to run the world model; None picks the fastest there is.
-        shard: Of several jobs, the one this is: 1/4 is the first of four. Each job encodes its share of the episodes
-            into `<output_root>.parts`; when all are in one such folder, the same command without this flag makes the
-            dataset of them. Where machines share a disk, set LEROBOT_WM_CACHE to a folder of its own for each: they
-            must not decode frames into one file.
-        push_to_hub: Upload the result as `output_repo_id`; also one that was encoded before.
-        private: Upload to a private repository.
-        license: Licence of the uploaded dataset, as the Hub names it; None takes what the source's card says.
-    """
-
-    world_model_path: str
-    dataset: SourceConfig
-    output_repo_id: str
-    output_root: Path
-    sample: bool = False
-    seed: int = 0
-    device: str | None = None
-    shard: str | None = None
-    push_to_hub: bool = False
-    private: bool = False
-    license: str | None = None
 
 
 def encode(

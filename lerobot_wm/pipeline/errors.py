@@ -1,11 +1,8 @@
-"""How a command ends early: with one line that says what its user can do, and with its worker processes."""
+"""How a command ends early: with one line that says what its user can do."""
 
 import errno
-import multiprocessing
 import os
-import signal
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from traceback import clear_frames, walk_tb
@@ -82,39 +79,6 @@ def explained_to_parent() -> Iterator[None]:
         if line is None:
             raise
         raise WorkerError(line) from error
-
-
-def end_with_parent() -> None:
-    """Have this worker end when its parent does, however that ends: it would write on into its output."""
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-
-
-def _exit_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-@contextmanager
-def interrupts_held() -> Iterator[None]:
-    """Let Ctrl-C wait; processes started meanwhile never see it, and leave it to this one."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def workers_interrupted() -> Iterator[None]:
-    """On Ctrl-C, or where a generator is closed, end this process's workers instead of waiting for what they began."""
-    try:
-        yield
-    except (KeyboardInterrupt, GeneratorExit):
-        for worker in multiprocessing.active_children():
-            worker.terminate()
-        raise
 
 
 def disk_problem(error: BaseException) -> str | None:

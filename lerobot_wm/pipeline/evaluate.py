@@ -8,11 +8,9 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from copy import deepcopy
 from functools import partialmethod
 from io import StringIO
-from multiprocessing import get_context
 
 import torch
 from lerobot.configs import parser
@@ -23,17 +21,12 @@ from tqdm import tqdm
 
 from lerobot_wm.cores import usable_cores
 from lerobot_wm.data.lock import sole_writer
-from lerobot_wm.pipeline.errors import (
-    end_with_parent,
-    explained_to_parent,
-    interrupts_held,
-    workers_interrupted,
-)
 from lerobot_wm.pipeline.eval_config import EvaluateConfig
 from lerobot_wm.pipeline.processors import check_policy_path, check_processors
 from lerobot_wm.pipeline.remarks import drop_remarks
 from lerobot_wm.pipeline.rollouts import TaskRunner, task_names
 from lerobot_wm.pipeline.wandb_log import log_evaluation, wandb_run
+from lerobot_wm.pipeline.workers import map_in_workers
 from lerobot_wm.policies.multi_task_config import MultiTaskConfig
 from lerobot_wm.report.provenance import provenance
 from lerobot_wm.report.records import Record, record_line
@@ -46,7 +39,6 @@ _worker_run: Callable[[str], list[Record]]
 
 def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
     global _worker_run
-    end_with_parent()
     drop_remarks()
     # LeRobot's bars of several processes would overwrite each other, and the parent's.
     tqdm.__init__ = partialmethod(tqdm.__init__, file=StringIO())  # type: ignore[assignment, method-assign]
@@ -55,27 +47,16 @@ def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
 
 
 def _run_in_worker(task: str) -> list[Record]:
-    with explained_to_parent():
-        return _worker_run(task)
+    return _worker_run(task)
 
 
 def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
     """Records task by task, in the order of `tasks`; a single process has its policy when this returns."""
-    return map(TaskRunner(cfg).run, tasks) if cfg.num_workers == 1 else _rollouts_of_workers(cfg, tasks)
-
-
-def _rollouts_of_workers(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
+    if cfg.num_workers == 1:
+        return map(TaskRunner(cfg).run, tasks)
     workers = min(cfg.num_workers, len(tasks))
     threads = max(1, usable_cores() // workers)
-    with (
-        ProcessPoolExecutor(
-            workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=(cfg, threads)
-        ) as pool,
-        workers_interrupted(),
-    ):
-        with interrupts_held():
-            of_tasks = pool.map(_run_in_worker, tasks)
-        yield from of_tasks
+    return map_in_workers(_run_in_worker, tasks, workers, _start_worker, cfg, threads)
 
 
 def evaluate(cfg: EvaluateConfig) -> list[Record]:

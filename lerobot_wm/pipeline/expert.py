@@ -1,11 +1,8 @@
 """`lerobot-wm expert`: the scripted expert as an arm, one rollout without noise on each variation."""
 
-import sys
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import draccus
@@ -14,11 +11,13 @@ from rich.console import Console
 from tqdm import tqdm
 
 from lerobot_wm.constants import MAX_EPISODE_STEPS, NUM_VARIATIONS, REPORTED_VARIATION_SET
+from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import check_variation_set, is_seen, parse_variations
 from lerobot_wm.pipeline.collect_episode import demonstrate
 from lerobot_wm.pipeline.quiet import quiet, silence
+from lerobot_wm.pipeline.workers import map_in_workers
 from lerobot_wm.report.records import Record, record_line
 from lerobot_wm.report.tables import table_by_split, terminal_tables
 
@@ -70,9 +69,14 @@ def roll_out_expert(cfg: ExpertConfig) -> list[Record]:
 
     Raises:
         ValueError, FileExistsError: see `ExpertConfig.validate`.
+        BlockingIOError: another process writes these records.
     """
     cfg.validate()
-    tasks = resolve_tasks(cfg.tasks)
+    with sole_writer(cfg.records_file):
+        return _write_records(cfg, resolve_tasks(cfg.tasks))
+
+
+def _write_records(cfg: ExpertConfig, tasks: tuple[str, ...]) -> list[Record]:
     records = [
         record
         for of_task in tqdm(_rollouts(cfg, tasks), total=len(tasks), desc="Rolling out", unit="task")
@@ -91,10 +95,7 @@ def _rollouts(cfg: ExpertConfig, tasks: tuple[str, ...]) -> Iterator[list[Record
         with quiet():
             yield from map(partial(_roll_out, cfg), tasks)
         return
-    with ProcessPoolExecutor(
-        min(cfg.num_workers, len(tasks)), mp_context=get_context("spawn"), initializer=silence
-    ) as pool:
-        yield from pool.map(partial(_roll_out, cfg), tasks)
+    yield from map_in_workers(partial(_roll_out, cfg), tasks, min(cfg.num_workers, len(tasks)), silence)
 
 
 def _roll_out(cfg: ExpertConfig, task: str) -> list[Record]:
@@ -123,10 +124,7 @@ def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record
 
 def main() -> None:
     """Entry point of `lerobot-wm expert`."""
-    try:
-        cfg = draccus.parse(ExpertConfig, args=sys.argv[1:])
-        records = roll_out_expert(cfg)
-    except (ValueError, FileExistsError) as error:
-        sys.exit(f"lerobot-wm expert: {error}")
+    cfg = draccus.parse(ExpertConfig)
+    records = roll_out_expert(cfg)
     Console(width=100).print(*terminal_tables(table_by_split("Success of the scripted expert", records)))
     print(f"Records: {cfg.records_file}")

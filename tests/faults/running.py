@@ -43,9 +43,14 @@ class Running:
         self._output = output
         self._ask = ask
 
+    @property
+    def processes(self) -> list[int]:
+        """Its own and those of its workers that live."""
+        return processes_of(self._pid)
+
     def interrupt_when(self, condition: Callable[[], object]) -> Ended:
         """Wait for a condition, then do what Ctrl-C does: interrupt every process of the group."""
-        wait_until(lambda: condition() or not processes_of(self._pid))
+        wait_until(lambda: condition() or not self.processes)
         os.killpg(self._pid, signal.SIGINT)
         return self.wait()
 
@@ -62,7 +67,7 @@ class Running:
         """Wait for its end, and for that of its workers."""
         code = self._ask({"wait": self._pid})
         # The server that workers are forked from ends after its parent, each with seconds of tidying up.
-        wait_until(lambda: not processes_of(self._pid))
+        wait_until(lambda: not self.processes)
         return Ended(code, self._output.read_text())
 
 
@@ -153,13 +158,17 @@ class Inputs:
     latents: Path
     policy: Path
 
-    def command(self, name: str, output: Path) -> str:
-        """A command that works for a few seconds, with its flags, into a folder."""
+    def command(self, name: str, output: Path, workers: int = 1) -> str:
+        """A command that works for a few seconds, with its flags, into a folder.
+
+        With two workers, `collect` and `eval` do twice as much, each worker one task.
+        """
+        tasks = ",".join(("reach-v3", "window-close-v3")[:workers])
         dataset = f"--dataset.repo_id=test/noise --dataset.root={self.dataset}"
         match name:
             case "collect":
-                sizes = "--tasks=reach-v3 --episodes_per_task=1 --steps_after_success=0 --image_size=16"
-                return f"collect {sizes} --num_workers=1 --repo_id=a/b --root={output}"
+                sizes = f"--tasks={tasks} --episodes_per_task=1 --steps_after_success=0 --image_size=16"
+                return f"collect {sizes} --num_workers={workers} --repo_id=a/b --root={output}"
             case "encode":
                 path = f"--world_model_path={self.world_model} --device=cpu"
                 return f"encode {path} {dataset} --output_repo_id=a/b --output_root={output}"
@@ -169,10 +178,9 @@ class Inputs:
                 )
                 return f"train --policy.type=wm_rssm {sizes} {TRAIN_FLAGS} {dataset} --output_dir={output}"
             case _:
-                env = (
-                    "--env.type=metaworld_mt --env.task=reach-v3 --env.episode_length=20 --eval.n_episodes=2"
-                )
-                return f"eval --policy.path={self.policy} --policy.device=cpu {env} --seed=0 --output_dir={output}"
+                env = f"--env.type=metaworld_mt --env.task={tasks} --env.episode_length=20"
+                rollouts = f"--eval.n_episodes=2 --seed=0 --num_workers={workers}"
+                return f"eval --policy.path={self.policy} --policy.device=cpu {env} {rollouts} --output_dir={output}"
 
 
 def make_inputs(commands: Commands, folder: Path) -> Inputs:

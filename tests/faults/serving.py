@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import sys
 
 
@@ -22,6 +23,8 @@ def serve() -> None:
             answer = os.fork()
             if answer == 0:
                 os.setpgid(0, 0)
+                # A shell has what it puts into the background ignore Ctrl-C: tests that run there, too.
+                signal.signal(signal.SIGINT, signal.default_int_handler)
                 output = os.open(request["output"], os.O_WRONLY | os.O_CREAT)
                 os.dup2(output, 1)
                 os.dup2(output, 2)

@@ -5,14 +5,18 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.io_utils import load_json
 
-from lerobot_wm.data.cache import CACHE_VARIABLE
+from lerobot_wm.data.cache import CACHE_VARIABLE, camera_frames
 from lerobot_wm.data.check import check_dataset
 from lerobot_wm.data.lock import sole_writer
+from lerobot_wm.pipeline.errors import disk_problem
 from lerobot_wm.report.records import read_records
+from tests.faults.conftest import WIDE
 from tests.faults.running import Commands, Inputs, remount, small_disk, wait_until
 
 NAMES = ("collect", "encode", "train", "eval")
@@ -60,6 +64,21 @@ def test_a_full_disk(name: str, processes: Commands, inputs: Inputs, disk: Path)
     assert not list(disk.glob("*.partial"))
 
 
+def test_a_disk_that_is_full_for_workers(processes: Commands, inputs: Inputs, disk: Path) -> None:
+    remount(disk, "size=40k")
+    command = inputs.command("collect", disk / "output", workers=2)
+    ended = processes.run(command)
+    assert ended.code == 1, ended.printed
+    assert "Traceback" not in ended.printed
+    assert "No space left on device: make room there, or choose another place; then" in ended.last_line
+    assert not (disk / "output").exists()
+
+    remount(disk, "size=400m")
+    again = processes.run(command)
+    assert again.code == 0, again.printed
+    check_result("collect", disk / "output")
+
+
 def test_a_disk_that_is_full_at_the_second_checkpoint(
     processes: Commands, inputs: Inputs, disk: Path
 ) -> None:
@@ -92,6 +111,20 @@ def test_no_room_for_decoded_frames(processes: Commands, inputs: Inputs, disk: P
     assert ended.code == 1, ended.printed
     assert f"make room there, or set {CACHE_VARIABLE} to a folder on a larger disk" in ended.last_line
     assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_a_disk_that_fills_while_frames_are_decoded(
+    dataset: Path, disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remount(disk, "size=40k")
+    source = LeRobotDataset("test/faults", root=dataset)
+    monkeypatch.setenv(CACHE_VARIABLE, str(disk))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**9))  # a moment ago
+    with pytest.raises(OSError, match="No space left on device") as found:
+        camera_frames(source, WIDE)
+    assert str(disk) in str(disk_problem(found.value))
+    remount(disk, "size=400m")
+    assert camera_frames(source, WIDE)[-1].any()
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,6 +1,5 @@
 """Ctrl-C: one line that says how to go on, no traceback, no process left, and the same command goes on."""
 
-import shlex
 from pathlib import Path
 
 import pytest
@@ -47,7 +46,7 @@ def test_the_same_command_goes_on(name: str, processes: Commands, inputs: Inputs
 def test_training_says_how_to_go_on(processes: Commands, inputs: Inputs, tmp_path: Path) -> None:
     run = tmp_path / "run"
     last = run / "checkpoints" / "last"
-    work = processes.start(inputs.command("train", run), "--steps=100000")
+    work = processes.start(inputs.command("train", run), "--steps=150")
     ended = work.interrupt_when(last.exists)
     check_interrupted(ended)
     _, advice, _ = ended.last_line.split("`")
@@ -61,7 +60,7 @@ def test_training_says_how_to_go_on(processes: Commands, inputs: Inputs, tmp_pat
 
 
 def test_before_the_first_checkpoint(processes: Commands, inputs: Inputs, tmp_path: Path) -> None:
-    command = f"{inputs.command('train', tmp_path / 'run')} --steps=100000 --save_freq=50000"
+    command = f"{inputs.command('train', tmp_path / 'run')} --steps=3000 --save_freq=3000"
     ended = processes.start(command).interrupt_when((tmp_path / "run" / "train_log.jsonl").exists)
     check_interrupted(ended)
     advice = f"there is no checkpoint yet: remove {tmp_path / 'run'} and give the same command again."
@@ -73,20 +72,20 @@ def test_before_the_first_checkpoint(processes: Commands, inputs: Inputs, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "flags", "begun"),
-    [
-        ("collect", "--tasks=reach-v3,window-close-v3 --num_workers=2", "output.shards/unfinished-*/*"),
-        ("eval", "--env.task=reach-v3,window-close-v3 --num_workers=2", "output/*.part"),
-    ],
+    ("name", "begun"), [("collect", "output.shards/unfinished-*/*"), ("eval", "output/*.part")]
 )
-def test_workers_end_too(
-    name: str, flags: str, begun: str, processes: Commands, inputs: Inputs, tmp_path: Path
-) -> None:
-    words = shlex.split(inputs.command(name, tmp_path / "output"))
-    given = {flag.split("=")[0] for flag in flags.split()}
-    command = " ".join([word for word in words if word.split("=")[0] not in given]) + f" {flags}"
+def test_workers_end_too(name: str, begun: str, processes: Commands, inputs: Inputs, tmp_path: Path) -> None:
+    command = inputs.command(name, tmp_path / "output", workers=2)
     ended = processes.start(command).interrupt_when(lambda: list(tmp_path.glob(begun)))
     check_interrupted(ended)
     assert not list(tmp_path.glob("output.shards/[!u]*")), "no worker finished what it had begun"
     again = processes.run(command)
     assert again.code == 0, again.printed
+
+
+def test_the_expert_and_its_workers_end(processes: Commands, tmp_path: Path) -> None:
+    command = f"expert --tasks=reach-v3,window-close-v3 --num_workers=2 --output_dir={tmp_path / 'output'}"
+    work = processes.start(command)
+    ended = work.interrupt_when(lambda: len(work.processes) >= 3)
+    check_interrupted(ended)
+    assert not list(tmp_path.rglob("records.jsonl*"))

@@ -1,0 +1,121 @@
+"""An Accelerator that hands LeRobot's training loop batches from RAM or GPU memory."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from accelerate import Accelerator, DistributedDataParallelKwargs, InitProcessGroupKwargs
+from accelerate.data_loader import BatchSamplerShard
+from lerobot.configs.train import TrainPipelineConfig
+from torch import Tensor
+
+from lerobot_wm.data.loader import RamLoader
+from lerobot_wm.pipeline.divergence import LossWatch
+from lerobot_wm.policies.cameras import ImagePolicyConfig
+
+# How long processes wait for the one that decodes or encodes; by default they give up after minutes.
+_PATIENCE = timedelta(days=1)
+
+
+class RamAccelerator(Accelerator):
+    """An Accelerator whose data loaders serve LeRobot's batches from memory; everything else is accelerate's.
+
+    Args:
+        train_config: Of the run: names the policy, whose cameras alone are served.
+        **kwargs: accelerate's own.
+    """
+
+    def __init__(self, train_config: TrainPipelineConfig, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self._train_config = train_config
+        self._watch = LossWatch()
+        self._loaders: list[RamLoader] = []  # that of the training data first
+
+    def prepare_model(self, model: Any, *args: Any, **kwargs: Any) -> Any:
+        """Prepare the policy as accelerate does, and watch its loss."""
+        prepared = super().prepare_model(model, *args, **kwargs)
+        self._watch.attach(prepared)
+        return prepared
+
+    def backward(self, loss: Tensor, **kwargs: Any) -> None:
+        """Go backward as accelerate does, and stop the training where that gives no finite gradient.
+
+        Raises:
+            DivergenceError: The loss or its gradient is NaN or infinite; the weights are still those before the step.
+        """
+        super().backward(loss, **kwargs)
+        if self.scaler is None:  # that of float16 skips such steps by itself
+            last = Path(self._train_config.output_dir) / "checkpoints" / "last"
+            self._watch.check(loss, self._loaders[0], last)
+
+    def prepare_data_loader(self, data_loader: Any, *args: Any, **kwargs: Any) -> RamLoader:
+        """Replace the loader by one that reads the same samples, this process's share of them, from memory.
+
+        Step k of W processes reads batches kW to kW + W - 1 of the epoch, one each: together the batch of one process
+        with a W times larger batch size. An epoch's last step is filled up with the epoch's first samples.
+        """
+        batch_sampler = data_loader.batch_sampler
+        if self.num_processes > 1:
+            batch_sampler = BatchSamplerShard(batch_sampler, self.num_processes, self.process_index)
+        with self.in_turn():  # the first decodes the frames, the others map them
+            loader = RamLoader(data_loader, batch_sampler, self.device, cameras_to_serve(self._train_config))
+        self._loaders.append(loader)
+        return loader
+
+    @contextmanager
+    def in_turn(self) -> Iterator[None]:
+        """Let one process make files that the others then find there.
+
+        The main process goes first, then the first of each other host, whose disk may be its own, then the rest.
+        """
+        turn = 0 if self.is_main_process else 1 if self.is_local_main_process else 2
+        for _ in range(turn):
+            self.wait_for_everyone()
+        yield
+        for _ in range(turn, 2):
+            self.wait_for_everyone()
+
+
+def cameras_to_serve(cfg: TrainPipelineConfig) -> dict[str, tuple[int, int]] | None:
+    """The dataset's cameras that the policy looks at, and (H, W) it brings their images to.
+
+    None, all of them as they are, where the policy is not one of ours.
+    """
+    policy = cfg.policy
+    if not isinstance(policy, ImagePolicyConfig):
+        return None
+    names_in_dataset = {renamed: key for key, renamed in cfg.rename_map.items()}
+    return {names_in_dataset.get(key, key): policy.image_size for key in policy.cameras}
+
+
+def make_accelerator(cfg: TrainPipelineConfig) -> RamAccelerator:
+    """The Accelerator LeRobot's train() would make for the policy of a run, with our loaders.
+
+    Raises:
+        RuntimeError: Several processes were asked for, and accelerate started one.
+    """
+    policy = cfg.policy
+    # As in LeRobot: a policy's own `dtype` decides the precision, `use_amp` where it has none.
+    dtype = getattr(policy, "dtype", "bfloat16" if policy.use_amp else "float32")
+    accelerator = RamAccelerator(
+        cfg,
+        step_scheduler_with_optimizer=False,
+        mixed_precision={"bfloat16": "bf16", "float16": "fp16"}.get(dtype, "no"),
+        kwargs_handlers=[
+            DistributedDataParallelKwargs(find_unused_parameters=True),
+            InitProcessGroupKwargs(timeout=_PATIENCE),
+        ],
+        cpu=policy.device == "cpu",
+    )
+    # Without GPUs accelerate has no launcher for several processes, but this is what it sets where they were asked for.
+    launched = {"ACCELERATE_USE_CPU", "MASTER_ADDR"} <= os.environ.keys()
+    if launched and accelerator.device.type == "cpu" and accelerator.num_processes == 1:
+        raise RuntimeError(
+            "accelerate launch was asked for several processes on CPUs and started one, which would train on a smaller "
+            "batch than was meant. torchrun starts them: "
+            "torchrun --nproc_per_node=2 -m lerobot_wm.cli train --policy.device=cpu ..."
+        )
+    return accelerator
