@@ -68,7 +68,7 @@ def test_the_second_set_has_its_own_rollouts(
     ],
 )
 def test_bad_flags(flags: str, message: str, tmp_path: Path, lerobot_wm_command: Callable[..., None]) -> None:
-    with pytest.raises(SystemExit, match=message):
+    with pytest.raises(ValueError, match=message):
         lerobot_wm_command(f"expert {flags} --output_dir={tmp_path}")
 
 
@@ -76,5 +76,5 @@ def test_earlier_records_are_never_overwritten(
     tmp_path: Path, lerobot_wm_command: Callable[..., None]
 ) -> None:
     (tmp_path / "records.jsonl").write_text("")
-    with pytest.raises(SystemExit, match="remove it"):
+    with pytest.raises(FileExistsError, match="remove it"):
         lerobot_wm_command(f"expert --output_dir={tmp_path}")
