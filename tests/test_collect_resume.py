@@ -86,7 +86,7 @@ def test_killed_and_started_again(undisturbed: Path, tmp_path: Path) -> None:
     assert run.poll() is None
     os.kill(run.pid, signal.SIGKILL)
     run.wait()
-    wait_until(lambda: not processes_of(run.pid), seconds=10)  # workers end with their parent
+    wait_until(lambda: not processes_of(run.pid))  # workers end with their parent
 
     finished = [path.parent for path in shards.glob(f"[!u]*/{SHARD_RECORD}")]
     assert 1 <= len(finished) < SHARDS
@@ -142,7 +142,7 @@ def killed_at_random(root: Path, moments: random.Random) -> bool:
     time.sleep(moments.uniform(0, time.monotonic() - start))  # as slow as the machine is now
     if run.poll() is None:
         os.killpg(run.pid, signal.SIGKILL)
-    wait_until(lambda: not processes_of(run.pid), seconds=10)
+    wait_until(lambda: not processes_of(run.pid))
     return run.wait() == -signal.SIGKILL
 
 
