@@ -76,7 +76,9 @@ class WorldModel(LatentModel):
         if state is None:
             state = self.rssm.initial_state(images.shape[0])
         embeds = self.embed(images, proprio)
-        return self.rssm.observe(embeds, self.action_scaling(prev_actions), state, sample=sample)[0]
+        return self.rssm.observe(embeds, self._told(self.action_scaling(prev_actions)), state, sample=sample)[
+            0
+        ]
 
     def filter(
         self, images: Tensor, actions: Tensor, proprio: Tensor | None = None, *, sample: bool = False
@@ -97,12 +99,12 @@ class WorldModel(LatentModel):
     def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> RSSMState:
         """`filter` for images that are embedded already: embeds (B, T, 1024), actions a_t (B, T, A)."""
         state = self.rssm.initial_state(embeds.shape[0])
-        return self.rssm.observe(embeds, self._shift(actions), state, sample=sample)[0]
+        return self.rssm.observe(embeds, self._told(self._shift(actions)), state, sample=sample)[0]
 
     def filter_with_kl(self, embeds: Tensor, actions: Tensor) -> tuple[RSSMState, Tensor]:
         """`filter_embeds`, and how far each image moved the belief: KL(posterior || prior) in nats, (B, T)."""
         state = self.rssm.initial_state(embeds.shape[0])
-        states, posterior = self.rssm.observe(embeds, self._shift(actions), state, sample=False)
+        states, posterior = self.rssm.observe(embeds, self._told(self._shift(actions)), state, sample=False)
         return states, posterior.kl(self.rssm.prior(states.deter))
 
     def imagine(self, state: RSSMState, actions: Tensor, *, sample: bool = False) -> RSSMState:
@@ -147,7 +149,7 @@ class WorldModel(LatentModel):
         """
         embeds = self.embed(images, proprio)
         initial = self.rssm.initial_state(images.shape[0])
-        states, posterior = self.rssm.observe(embeds, self._shift(actions), initial, sample=True)
+        states, posterior = self.rssm.observe(embeds, self._told(self._shift(actions)), initial, sample=True)
         prior = self.rssm.prior(states.deter)
         latents = states.latent  # (B, T, D+S)
 
@@ -163,6 +165,16 @@ class WorldModel(LatentModel):
             reward_error = (self.predict_reward(latents[:, 1:]) - rewards[:, :-1].float()).square()
             errors["reward_loss"] = nn.functional.pad(reward_error, (1, 0))
         return world_model_loss(errors, posterior.kl(prior), valid, self.config)
+
+    def _told(self, prev_actions: Tensor) -> Tensor:
+        """What the recurrence is told of scaled actions a_{t-1} (B, T, A): zeros where they are hidden."""
+        share = self.config.action_dropout
+        if share == 0:
+            return prev_actions
+        if not self.training:
+            return torch.zeros_like(prev_actions)
+        told = torch.rand(len(prev_actions), 1, 1, device=prev_actions.device) >= share  # (B, 1, 1)
+        return prev_actions * told
 
     def _shift(self, actions: Tensor) -> Tensor:
         """a_t (B, T, A) -> scaled a_{t-1}, with a zero action (in the dataset's units) before the first frame."""

@@ -199,3 +199,32 @@ def test_weighted_image_error_is_what_the_model_descends() -> None:
         parts.append(model.loss(images, actions, valid)[1])
     assert parts[1]["image_loss"] > 2 * parts[0]["image_loss"]
     assert parts[1]["kl"] == parts[0]["kl"]
+
+
+@torch.no_grad()
+def test_with_hidden_actions_the_filter_sees_images_alone_and_imagination_is_told() -> None:
+    model = make_world_model(action_dropout=0.5).eval()
+    images, actions = two_lamps(2, 6, seed=0)
+    states = model.filter(images, actions)
+    assert torch.equal(states.latent, model.filter(images, -actions).latent)
+    stepwise = model.observe(images, torch.ones(2, 6, ACTION_DIM))
+    torch.testing.assert_close(stepwise.latent, states.latent)
+    assert not torch.equal(states.latent, model.filter(images.flip(1), actions).latent)
+    start = states.last()
+    assert not torch.equal(model.imagine(start, actions).latent, model.imagine(start, -actions).latent)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_training_hides_actions_in_a_share_of_the_windows(share: float) -> None:
+    model = make_world_model(action_dropout=share, predict_reward=False, free_nats=0.0)
+    images, actions = two_lamps(64, 4, seed=0)
+    actions.requires_grad_()
+    loss, _ = model.loss(images, actions, torch.ones(64, 4, dtype=torch.bool))
+    (gradient,) = torch.autograd.grad(loss, actions)
+    hidden = (gradient == 0).all(dim=(1, 2)).float().mean().item()
+    assert hidden == pytest.approx(share, abs=0.15 if 0 < share < 1 else 0)
+
+
+def test_action_dropout_is_a_share() -> None:
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        RSSMConfig(action_dropout=1.5)
