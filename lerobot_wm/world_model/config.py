@@ -18,10 +18,10 @@ class RSSMConfig:
         reward_scale: Weight of the reward loss.
         image_error_weight: w of the image loss e² (1 + w |e|), e in [-1, 1]; 0 is the paper's squared error. Above
             it, what is small and wrong weighs more.
-        action_dropout: Share of the training windows in which the recurrence is not told the actions. Above 0 it is never
-            told them where it filters. A demonstrator's action tells where the goal is as well as the image does: a
-            model that is always told it has no reason to look, and a policy on its latents copies its own last action.
-            Imagination is told the actions in any case.
+        action_dropout: Share of the training windows in which the recurrence is not told the actions. Above 0 it is
+            never told them where it filters. A demonstrator's action tells where the goal is as well as the image does:
+            a model that is always told it has no reason to look, and a policy on its latents copies its own last
+            action. Imagination is told the actions in any case.
         predict_reward: Whether there is a reward head (turned off for datasets without `next.reward`).
         use_proprio: Encode and reconstruct proprioception beside the image (the paper's discarded variant).
         image_channels: Channels of the image; filled from the dataset.
