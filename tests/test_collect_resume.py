@@ -111,13 +111,13 @@ def test_killed_and_started_again(undisturbed: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for left-over processes in /proc")
-@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
-def test_killed_at_random_moments(kills: int, undisturbed: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_killed_at_random_moments(undisturbed: Path, tmp_path: Path) -> None:
     """All processes of a collection at once, again and again."""
     root, shards = tmp_path / "dataset", tmp_path / "dataset.shards"
     moments = random.Random(0)
     killed = 0
-    while killed < kills:
+    while killed < 20:
         if killed_at_random(root, moments):
             killed += 1
             for shard in shards.glob("[!u]*"):  # not in work: whole

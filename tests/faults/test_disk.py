@@ -64,6 +64,7 @@ def test_a_full_disk(name: str, processes: Commands, inputs: Inputs, disk: Path)
     assert not list(disk.glob("*.partial"))
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_for_workers(processes: Commands, inputs: Inputs, disk: Path) -> None:
     remount(disk, "size=40k")
     command = inputs.command("collect", disk / "output", workers=2)

@@ -48,7 +48,7 @@ def test_collect(fault: str, tmp_path: Path) -> None:
             check_refused(words, "bogus", tmp_path / "output")
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_eval(workers: int, inputs: Inputs, tmp_path: Path) -> None:
     words = [*COMMAND, *inputs.command("eval", tmp_path / "output", workers).split()]
     check_refused(words, "egl", tmp_path / "output" / "videos", **NO_DRIVER)
