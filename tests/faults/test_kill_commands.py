@@ -23,7 +23,7 @@ EPISODES = 18  # encoded in two batches
 WRITTEN_LAST = {"wm_rssm": "optimizer_param_groups.json", "wm_iql": "scheduler_state.json"}
 FINAL = Path("checkpoints") / "000006"
 LAST = Path("checkpoints") / "last" / "pretrained_model"
-KILLS = [2, pytest.param(20, marks=pytest.mark.slow)]
+KILLS = [1, pytest.param(20, marks=pytest.mark.slow)]
 
 
 @pytest.fixture(scope="module")
