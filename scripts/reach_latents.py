@@ -18,14 +18,16 @@ import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.import_utils import register_third_party_plugins
+from reach_inputs import GOAL, HAND, TASK
+from sklearn.linear_model import Ridge
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.report.provenance import provenance
 
-TASK = "reach-v3"
-HAND, GOAL = slice(0, 3), slice(36, 39)  # of the simulator's state (m)
 PENALTY = 1e-2  # of the ridge regression, per frame and for features of unit variance
 FRAMES = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 30), (30, 60))  # of an episode: from, to before
 
@@ -64,10 +66,8 @@ def read(root: Path) -> Frames:
 
 def reading(x: Tensor, y: Tensor, others: Tensor) -> Tensor:
     """`y` (N, 3) for others (M, F), by a ridge regression fitted to features x (N, F)."""
-    mean, std, y_mean = x.mean(0), x.std(0) + 1e-6, y.mean(0)
-    x = (x - mean) / std
-    gram = x.T @ x + PENALTY * len(x) * torch.eye(x.shape[1])
-    return (others - mean) / std @ torch.linalg.solve(gram, x.T @ (y - y_mean)) + y_mean
+    regression = make_pipeline(StandardScaler(), Ridge(PENALTY * len(x))).fit(x.numpy(), y.numpy())
+    return torch.as_tensor(regression.predict(others.numpy()))
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.world_model.config import RSSMConfig
 from lerobot_wm.world_model.interface import LatentModel
 from lerobot_wm.world_model.losses import reconstruction_loss, world_model_loss
-from lerobot_wm.world_model.rssm import RSSM, RSSMState
+from lerobot_wm.world_model.rssm import RSSM, DiagonalNormal, RSSMState
 
 
 class WorldModel(LatentModel):
@@ -73,12 +73,8 @@ class WorldModel(LatentModel):
         Returns:
             s_t for every frame, (B, T, ·).
         """
-        if state is None:
-            state = self.rssm.initial_state(images.shape[0])
         embeds = self.embed(images, proprio)
-        return self.rssm.observe(embeds, self._told(self.action_scaling(prev_actions)), state, sample=sample)[
-            0
-        ]
+        return self._observe(embeds, self.action_scaling(prev_actions), state, sample=sample)[0]
 
     def filter(
         self, images: Tensor, actions: Tensor, proprio: Tensor | None = None, *, sample: bool = False
@@ -98,13 +94,11 @@ class WorldModel(LatentModel):
 
     def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> RSSMState:
         """`filter` for images that are embedded already: embeds (B, T, 1024), actions a_t (B, T, A)."""
-        state = self.rssm.initial_state(embeds.shape[0])
-        return self.rssm.observe(embeds, self._told(self._shift(actions)), state, sample=sample)[0]
+        return self._observe(embeds, self._shift(actions), sample=sample)[0]
 
     def filter_with_kl(self, embeds: Tensor, actions: Tensor) -> tuple[RSSMState, Tensor]:
         """`filter_embeds`, and how far each image moved the belief: KL(posterior || prior) in nats, (B, T)."""
-        state = self.rssm.initial_state(embeds.shape[0])
-        states, posterior = self.rssm.observe(embeds, self._told(self._shift(actions)), state, sample=False)
+        states, posterior = self._observe(embeds, self._shift(actions), sample=False)
         return states, posterior.kl(self.rssm.prior(states.deter))
 
     def imagine(self, state: RSSMState, actions: Tensor, *, sample: bool = False) -> RSSMState:
@@ -148,8 +142,7 @@ class WorldModel(LatentModel):
             The scalar loss and its parts by name, each a detached scalar.
         """
         embeds = self.embed(images, proprio)
-        initial = self.rssm.initial_state(images.shape[0])
-        states, posterior = self.rssm.observe(embeds, self._told(self._shift(actions)), initial, sample=True)
+        states, posterior = self._observe(embeds, self._shift(actions), sample=True)
         prior = self.rssm.prior(states.deter)
         latents = states.latent  # (B, T, D+S)
 
@@ -165,6 +158,14 @@ class WorldModel(LatentModel):
             reward_error = (self.predict_reward(latents[:, 1:]) - rewards[:, :-1].float()).square()
             errors["reward_loss"] = nn.functional.pad(reward_error, (1, 0))
         return world_model_loss(errors, posterior.kl(prior), valid, self.config)
+
+    def _observe(
+        self, embeds: Tensor, prev_actions: Tensor, state: RSSMState | None = None, *, sample: bool
+    ) -> tuple[RSSMState, DiagonalNormal]:
+        """The RSSM's `observe`, from scaled actions a_{t-1} (B, T, A) as far as it is told them; None starts anew."""
+        if state is None:
+            state = self.rssm.initial_state(embeds.shape[0])
+        return self.rssm.observe(embeds, self._told(prev_actions), state, sample=sample)
 
     def _told(self, prev_actions: Tensor) -> Tensor:
         """What the recurrence is told of scaled actions a_{t-1} (B, T, A): zeros where they are hidden."""

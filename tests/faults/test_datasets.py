@@ -77,18 +77,22 @@ def test_a_broken_dataset_is_not_merged(whole_dataset: Path, dataset: Path, tmp_
     assert not (tmp_path / "merged").exists()
 
 
-def test_commands_end_in_one_line_and_ask_no_network(whole_dataset: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("all_commands", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_commands_end_in_one_line_and_ask_no_network(
+    all_commands: bool, whole_dataset: Path, tmp_path: Path
+) -> None:
     lines = []
     for number, (break_it, _) in enumerate(FAULTS.values()):
         root = shutil.copytree(whole_dataset, tmp_path / str(number))
         break_it(root)
         flags = ["--dataset.repo_id=test/faults", f"--dataset.root={root}"]
-        if number % 2:  # in turn: each takes a second
-            training = ["--policy.type=wm_rssm", "--policy.push_to_hub=false", "--policy.device=cpu"]
-            lines.append(["train", *flags, *training, f"--output_dir={tmp_path / 'run'}"])
-        else:
-            output = ["--output_repo_id=a/b", f"--output_root={tmp_path / 'out'}"]
-            lines.append(["relabel", *flags, "--reward=next.reward", *output])
+        training = ["--policy.type=wm_rssm", "--policy.push_to_hub=false", "--policy.device=cpu"]
+        output = ["--output_repo_id=a/b", f"--output_root={tmp_path / 'out'}"]
+        commands = [
+            ["train", *flags, *training, f"--output_dir={tmp_path / 'run'}"],
+            ["relabel", *flags, "--reward=next.reward", *output],
+        ]
+        lines += commands if all_commands else [commands[number % 2]]  # each takes a second
     environment = {name: value for name, value in os.environ.items() if name != "HF_HUB_OFFLINE"}
     run = subprocess.run(
         [sys.executable, "tests/faults/breakage.py"],
