@@ -18,10 +18,17 @@ class RSSMConfig:
         reward_scale: Weight of the reward loss.
         image_error_weight: w of the image loss e² (1 + w |e|), e in [-1, 1]; 0 is the paper's squared error. Above
             it, what is small and wrong weighs more.
+        decode_share: Share of each window's frames that are reconstructed, drawn anew in each step. The decoder is four
+            fifths of a step's arithmetic: with a part of the frames the same time has room for more steps.
         action_dropout: Share of the training windows in which the recurrence is not told the actions. Above 0 it is
             never told them where it filters. A demonstrator's action tells where the goal is as well as the image does:
             a model that is always told it has no reason to look, and a policy on its latents copies its own last
             action. Imagination is told the actions in any case.
+        action_scale: Weight of the action loss: a head predicts a_t from s_t, so that s_t holds what the demonstrator
+            acted on, however small it is in the image. 0: no such head.
+        image_shift: Pixels by which each training frame is shifted at random, up or down and left or right, before it
+            is encoded; what is reconstructed is not shifted. Demonstrations of few goals can be told apart by what
+            else is in the image, to the pixel; once that moves, the goal has to be located.
         predict_reward: Whether there is a reward head (turned off for datasets without `next.reward`).
         use_proprio: Encode and reconstruct proprioception beside the image (the paper's discarded variant).
         image_channels: Channels of the image; filled from the dataset.
@@ -38,7 +45,10 @@ class RSSMConfig:
     free_nats: float = 3.0
     reward_scale: float = 1.0
     image_error_weight: float = 0.0
+    decode_share: float = 1.0
     action_dropout: float = 0.0
+    action_scale: float = 0.0
+    image_shift: int = 0
     predict_reward: bool = True
     use_proprio: bool = False
     image_channels: int = 0
@@ -46,6 +56,10 @@ class RSSMConfig:
     proprio_dim: int = 0
 
     def __post_init__(self) -> None:
+        if not 0 < self.decode_share <= 1:
+            raise ValueError(
+                f"decode_share is {self.decode_share:g}; a share of frames is above 0 and at most 1."
+            )
         if not 0 <= self.action_dropout <= 1:
             raise ValueError(
                 f"action_dropout is {self.action_dropout:g}; a share of windows is between 0 and 1."

@@ -39,7 +39,12 @@ def world_model_loss(
         The scalar loss and the named parts (detached scalars), the unclamped KL and the share of steps under
         the free nats among them.
     """
-    scales = {"image_loss": 1.0, "proprio_loss": 1.0, "reward_loss": config.reward_scale}
+    scales = {
+        "image_loss": 1.0,
+        "proprio_loss": 1.0,
+        "reward_loss": config.reward_scale,
+        "action_loss": config.action_scale,
+    }
     metrics = {name: masked_mean(error, valid) for name, error in errors.items()}
     kl_loss = masked_mean(kl.clamp(min=config.free_nats), valid)
     loss = sum((scales[name] * value for name, value in metrics.items()), start=config.kl_scale * kl_loss)

@@ -1,8 +1,11 @@
 """The world model: image encoder, RSSM, image decoder and reward head (paper section 3.1.1)."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
+from lerobot_wm.nn.augment import random_crop
 from lerobot_wm.nn.conv import EMBED_DIM, ConvDecoder, ConvEncoder
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
@@ -31,6 +34,8 @@ class WorldModel(LatentModel):
         self.action_scaling = Affine(config.action_dim)
         if config.predict_reward:
             self.reward_head = MLP(config.latent_dim, [config.reward_hidden_dim] * 2, 1)
+        if config.action_scale > 0:
+            self.action_head = MLP(config.latent_dim, [config.hidden_dim] * 2, config.action_dim)
         if config.use_proprio:
             self.proprio_scaling = Affine(config.proprio_dim)
             self.proprio_fusion = MLP(EMBED_DIM + config.proprio_dim, [EMBED_DIM], EMBED_DIM)
@@ -141,23 +146,61 @@ class WorldModel(LatentModel):
         Returns:
             The scalar loss and its parts by name, each a detached scalar.
         """
-        embeds = self.embed(images, proprio)
+        embeds = self.embed(self._jitter(images), proprio)
         states, posterior = self._observe(embeds, self._shift(actions), sample=True)
         prior = self.rssm.prior(states.deter)
         latents = states.latent  # (B, T, D+S)
 
-        decoded = self.decoder(latents.flatten(0, 1)).unflatten(0, latents.shape[:2])
-        image_loss = reconstruction_loss(decoded, images, self.config.image_error_weight)  # (B, T)
-        errors = {"image_loss": image_loss}
+        errors = {"image_loss": self._image_loss(latents, images)}
         if self.config.use_proprio:
             errors["proprio_loss"] = reconstruction_loss(
                 self.proprio_decoder(latents), self.proprio_scaling(proprio)
             )
+        if self.config.action_scale > 0:
+            errors["action_loss"] = self._action_loss(embeds, latents, self.action_scaling(actions))
         if rewards is not None and self.config.predict_reward:
             # s_t predicts r_{t-1}: the first frame of a window has no reward to predict.
             reward_error = (self.predict_reward(latents[:, 1:]) - rewards[:, :-1].float()).square()
             errors["reward_loss"] = nn.functional.pad(reward_error, (1, 0))
         return world_model_loss(errors, posterior.kl(prior), valid, self.config)
+
+    def _image_loss(self, latents: Tensor, images: Tensor) -> Tensor:
+        """Error of images (B, T, C, 64, 64) decoded from s_t, (B, T).
+
+        In training with `decode_share` below 1 that of a few frames of each window, weighted so that its mean over
+        many draws is the mean of them all; the others' is 0.
+        """
+        windows, length = latents.shape[:2]
+        weight = self.config.image_error_weight
+        few = math.ceil(self.config.decode_share * length)
+        if few == length or not self.training:
+            decoded = self.decoder(latents.flatten(0, 1)).unflatten(0, (windows, length))
+            return reconstruction_loss(decoded, images, weight)
+        window = torch.arange(windows, device=images.device)[:, None]
+        frame = torch.rand(windows, length, device=images.device).argsort(1)[:, :few]  # (B, few)
+        decoded = self.decoder(latents[window, frame].flatten(0, 1)).unflatten(0, (windows, few))
+        error = reconstruction_loss(decoded, images[window, frame], weight)  # (B, few)
+        return error.new_zeros(windows, length).scatter(1, frame, error * length / few)
+
+    def _action_loss(self, embeds: Tensor, latents: Tensor, actions: Tensor) -> Tensor:
+        """Error of scaled actions a_t (B, T, A) read from s_t, and from what s_t is of o_t alone: (B, T).
+
+        A demonstrator's next action is much like the last one, which memory tells; one frame alone has to be looked at.
+        """
+        frames = embeds.flatten(0, 1).unsqueeze(1)  # (B * T, 1, E): each the first of an episode
+        unknown = frames.new_zeros(len(frames), 1, self.config.action_dim)
+        alone = self.rssm.observe(frames, unknown, self.rssm.initial_state(len(frames)), sample=True)[0]
+        from_memory, from_frame = (
+            reconstruction_loss(self.action_head(each), actions)
+            for each in (latents, alone.latent.view_as(latents))
+        )
+        return 0.5 * (from_memory + from_frame)
+
+    def _jitter(self, images: Tensor) -> Tensor:
+        """Images (B, T, C, 64, 64), in training each frame shifted by up to `image_shift` pixels."""
+        if self.config.image_shift == 0 or not self.training:
+            return images
+        return random_crop(images.flatten(0, 1), self.config.image_shift).unflatten(0, images.shape[:2])
 
     def _observe(
         self, embeds: Tensor, prev_actions: Tensor, state: RSSMState | None = None, *, sample: bool

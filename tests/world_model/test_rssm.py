@@ -228,3 +228,63 @@ def test_training_hides_actions_in_a_share_of_the_windows(share: float) -> None:
 def test_action_dropout_is_a_share() -> None:
     with pytest.raises(ValueError, match="between 0 and 1"):
         RSSMConfig(action_dropout=1.5)
+
+
+def test_action_loss_makes_the_latent_hold_what_was_acted_on() -> None:
+    # The action is how bright the left lamp is: without the head nothing but the image asks for it.
+    images, _ = two_lamps(16, 2, seed=0)
+    actions = images[..., 0, 0, :1].repeat(1, 1, ACTION_DIM)  # (16, 2, A)
+    valid = torch.ones(16, 2, dtype=torch.bool)
+    model = make_world_model(action_scale=10.0, action_dropout=1.0, predict_reward=False)
+    optimizer = torch.optim.Adam(model.parameters(), 2e-3, fused=True)
+    losses = []
+    for _ in range(40):
+        loss, parts = model.loss(images, actions, valid)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(parts["action_loss"].item())
+    assert losses[-1] < 0.25 * losses[0]
+    assert model.encoder.layers[0].weight.grad.abs().max() > 0
+    assert not hasattr(make_world_model(), "action_head")
+
+
+def test_image_shift_moves_what_is_encoded_and_not_what_is_reconstructed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = make_world_model(image_channels=6, image_shift=4, predict_reward=False)
+    images = torch.zeros(2, 3, 6, 64, 64)
+    images[..., 32, 32] = 1.0
+    valid = torch.ones(2, 3, dtype=torch.bool)
+    encoded, targets = [], []
+    embed = model.embed
+    monkeypatch.setattr(model, "embed", lambda seen, proprio: encoded.append(seen) or embed(seen, proprio))
+    monkeypatch.setattr(
+        "lerobot_wm.world_model.model.reconstruction_loss",
+        lambda prediction, target, *weight: (
+            targets.append(target) or reconstruction_loss(prediction, target, *weight)
+        ),
+    )
+    for training in (True, False):
+        model.train(training).loss(images, torch.zeros(2, 3, ACTION_DIM), valid)
+    assert torch.equal(targets[0], images)
+    assert torch.equal(encoded[1], images)
+    lit = encoded[0].nonzero()  # (2 windows · 3 frames · 6 channels, 5)
+    assert len(lit) == 36
+    places = lit[:, 3:].reshape(6, 6, 2)  # frames, channels, row and column
+    assert (places == places[:, :1]).all(), "the channels of a frame move together"
+    assert (places - 32).abs().max() <= 4
+    assert len(places[:, 0].unique(dim=0)) > 2, "each frame moves by itself"
+
+
+def test_decoding_a_share_of_the_frames_descends_the_same_loss() -> None:
+    images, _ = two_lamps(4, 5, seed=0)
+    latents = torch.rand(4, 5, 40)
+    model = make_world_model(decode_share=0.4)
+    full = make_world_model()._image_loss(latents, images)
+    draws = torch.stack([model._image_loss(latents, images) for _ in range(400)]).detach()
+    assert ((draws > 0).sum(2) == 2).all(), "two of five frames of each window"
+    torch.testing.assert_close(draws.mean(0), full.detach(), rtol=0.25, atol=0)
+    assert torch.equal(model.eval()._image_loss(latents, images), full)
+    with pytest.raises(ValueError, match="at most 1"):
+        RSSMConfig(decode_share=0)
