@@ -164,9 +164,12 @@ def untrained(world_model: WorldModel, seed: int) -> WorldModel:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         fresh = WorldModel(world_model.config)
-    fresh.action_scaling.load_state_dict(world_model.action_scaling.state_dict())
-    if world_model.config.use_proprio:
-        fresh.proprio_scaling.load_state_dict(world_model.proprio_scaling.state_dict())
+    scaling = {
+        name: value
+        for name, value in world_model.state_dict().items()
+        if name.split(".")[0].endswith("_scaling")
+    }
+    fresh.load_state_dict(scaling, strict=False)
     return fresh.eval().to(world_model.action_scaling.offset.device)
 
 

@@ -18,6 +18,9 @@ class RSSMConfig:
         reward_scale: Weight of the reward loss.
         image_error_weight: w of the image loss e² (1 + w |e|), e in [-1, 1]; 0 is the paper's squared error. Above
             it, what is small and wrong weighs more.
+        standardize_images: Scale each channel of the images by the dataset's mean and standard deviation where they
+            enter and leave the model; the loss stays in [0, 1]. Off, as in the paper, the model first has to learn what
+            the mean image is.
         decode_share: Share of each window's frames that are reconstructed, drawn anew in each step. More than half of a
             step goes into the decoder: with a fifth of the frames a CPU core makes almost twice as many steps.
         action_dropout: Share of the training windows in which the recurrence is not told the actions. Above 0 it is
@@ -45,6 +48,7 @@ class RSSMConfig:
     free_nats: float = 3.0
     reward_scale: float = 1.0
     image_error_weight: float = 0.0
+    standardize_images: bool = False
     decode_share: float = 1.0
     action_dropout: float = 0.0
     action_scale: float = 0.0

@@ -21,8 +21,8 @@ class WorldModel(LatentModel):
     Time: frame t holds the image o_t, the action a_t executed there and the reward r_t that arrives with
     o_{t+1}. The filter reads (s_{t-1}, a_{t-1}, o_t), with a_{-1} = 0; the reward head predicts r_{t-1} from s_t.
 
-    Actions and proprioception enter in the dataset's own units; `action_scaling` and `proprio_scaling` hold the
-    statistics that normalise them, so that a checkpoint needs nothing beside itself.
+    Actions, proprioception and images enter in the dataset's own units; `action_scaling`, `proprio_scaling` and
+    `image_scaling` hold the statistics that normalise them, so that a checkpoint needs nothing beside itself.
     """
 
     def __init__(self, config: RSSMConfig) -> None:
@@ -32,6 +32,8 @@ class WorldModel(LatentModel):
         self.rssm = RSSM(config, EMBED_DIM)
         self.decoder = ConvDecoder(config.latent_dim, config.image_channels)
         self.action_scaling = Affine(config.action_dim)
+        if config.standardize_images:
+            self.image_scaling = Affine(config.image_channels)
         if config.predict_reward:
             self.reward_head = MLP(config.latent_dim, [config.reward_hidden_dim] * 2, 1)
         if config.action_scale > 0:
@@ -52,6 +54,8 @@ class WorldModel(LatentModel):
             (B, T, 1024).
         """
         batch_time = images.shape[:2]
+        if self.config.standardize_images:
+            images = self.image_scaling(images.movedim(-3, -1)).movedim(-1, -3)
         embeds = self.encoder(images.flatten(0, 1)).unflatten(0, batch_time)
         if self.config.use_proprio:
             embeds = self.proprio_fusion(torch.cat([embeds, self.proprio_scaling(proprio)], dim=-1))
@@ -112,8 +116,7 @@ class WorldModel(LatentModel):
 
     def decode(self, latents: Tensor) -> Tensor:
         """Images (..., C, 64, 64), clipped to [0, 1], from latents (..., D+S)."""
-        lead = latents.shape[:-1]
-        return self.decoder(latents.flatten(0, -2)).float().clamp(0, 1).unflatten(0, lead)
+        return self._decode(latents).clamp(0, 1)
 
     def expected_images(self, state: RSSMState) -> Tensor:
         """What o_t was expected to be, from s_{t-1} and a_{t-1} alone: (B, C, 64, 64) for the s_t (B, ·) it led to."""
@@ -164,6 +167,13 @@ class WorldModel(LatentModel):
             errors["reward_loss"] = nn.functional.pad(reward_error, (1, 0))
         return world_model_loss(errors, posterior.kl(prior), valid, self.config)
 
+    def _decode(self, latents: Tensor) -> Tensor:
+        """Images (..., C, 64, 64) in float32, not clipped, from latents (..., D+S)."""
+        images = self.decoder(latents.flatten(0, -2)).float()
+        if self.config.standardize_images:
+            images = self.image_scaling.inverse(images.movedim(-3, -1)).movedim(-1, -3)
+        return images.unflatten(0, latents.shape[:-1])
+
     def _image_loss(self, latents: Tensor, images: Tensor) -> Tensor:
         """Error of images (B, T, C, 64, 64) decoded from s_t, (B, T).
 
@@ -174,11 +184,10 @@ class WorldModel(LatentModel):
         weight = self.config.image_error_weight
         few = math.ceil(self.config.decode_share * length)
         if few == length or not self.training:
-            decoded = self.decoder(latents.flatten(0, 1)).unflatten(0, (windows, length))
-            return reconstruction_loss(decoded, images, weight)
+            return reconstruction_loss(self._decode(latents), images, weight)
         window = torch.arange(windows, device=images.device)[:, None]
         frame = torch.rand(windows, length, device=images.device).argsort(1)[:, :few]  # (B, few)
-        decoded = self.decoder(latents[window, frame].flatten(0, 1)).unflatten(0, (windows, few))
+        decoded = self._decode(latents[window, frame])
         error = reconstruction_loss(decoded, images[window, frame], weight)  # (B, few)
         return error.new_zeros(windows, length).scatter(1, frame, error * length / few)
 

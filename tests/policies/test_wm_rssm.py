@@ -48,12 +48,16 @@ def test_resume_is_exact(
 
 
 def test_plain_lerobot_train_takes_the_same_flags(
-    demos_root: Path, tmp_path: Path, lerobot_train_command: Callable[[str], None]
+    demos: LeRobotDataset, demos_root: Path, tmp_path: Path, lerobot_train_command: Callable[[str], None]
 ) -> None:
     flags = f"{SHORT} {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)} --output_dir={tmp_path / 'run'}"
-    lerobot_train_command(flags)
+    lerobot_train_command(f"{flags} --policy.rssm.standardize_images=true")
     policy = WMRSSMPolicy.from_pretrained(tmp_path / "run" / "checkpoints" / "last" / "pretrained_model")
     assert policy.config.window_length == 4
+    # The dataset's, not ImageNet's, which LeRobot puts in their place unless told not to.
+    stats, scaling = demos.meta.stats["observation.image"], policy.world_model.image_scaling
+    np.testing.assert_allclose(scaling.offset, stats["mean"].flatten(), rtol=1e-6)
+    np.testing.assert_allclose(scaling.scale, stats["std"].flatten(), rtol=1e-6)
 
 
 def test_held_out_loss(

@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.io_utils import load_stats
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
@@ -47,6 +48,12 @@ class WMRSSMPolicy(WorldModelPolicy):
             if config.rssm.use_proprio:
                 self.world_model.proprio_scaling.set_standard(
                     stat(dataset_stats, OBS_STATE, "mean"), stat(dataset_stats, OBS_STATE, "std")
+                )
+            if config.rssm.standardize_images:
+                # LeRobot lays ImageNet's statistics over the cameras' in memory, by default: read their own.
+                own = dataset_stats if dataset_meta is None else load_stats(dataset_meta.root)
+                self.world_model.image_scaling.set_standard(
+                    *(torch.cat([stat(own, key, name) for key in config.cameras]) for name in ("mean", "std"))
                 )
 
     def _has_reward(self, dataset_meta: LeRobotDatasetMetadata) -> bool:
