@@ -64,6 +64,8 @@ class RSSMConfig:
             raise ValueError(
                 f"decode_share is {self.decode_share:g}; a share of frames is above 0 and at most 1."
             )
+        if self.image_shift < 0:
+            raise ValueError(f"image_shift is {self.image_shift}; it is pixels, 0 or more.")
         if not 0 <= self.action_dropout <= 1:
             raise ValueError(
                 f"action_dropout is {self.action_dropout:g}; a share of windows is between 0 and 1."

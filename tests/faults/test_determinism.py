@@ -1,7 +1,7 @@
 """The same seed gives the same again, whatever was drawn before, at any batch size and in any order; another does not.
 
 That the number of processes, workers or jobs changes nothing, nor an interruption, is tested where those are:
-test_collect_resume, test_shards, test_evaluate, test_train_processes, test_kill_commands.
+test_kill_collection, test_shards, test_evaluate, test_train_processes, test_kill_commands.
 """
 
 import random

@@ -275,6 +275,8 @@ def test_image_shift_moves_what_is_encoded_and_not_what_is_reconstructed(
     assert (places == places[:, :1]).all(), "the channels of a frame move together"
     assert (places - 32).abs().max() <= 4
     assert len(places[:, 0].unique(dim=0)) > 2, "each frame moves by itself"
+    with pytest.raises(ValueError, match="0 or more"):
+        RSSMConfig(image_shift=-1)
 
 
 def test_decoding_a_share_of_the_frames_descends_the_same_loss() -> None:
