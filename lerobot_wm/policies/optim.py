@@ -45,3 +45,26 @@ class ActorCosineConfig(LRSchedulerConfig):
 
         others = len(optimizer.param_groups) - 1
         return LambdaLR(optimizer, [cosine, *[constant] * others])
+
+
+@LRSchedulerConfig.register_subclass("final_decay")
+@dataclass
+class FinalDecayConfig(LRSchedulerConfig):
+    """A constant rate that falls linearly to zero over the last part of a training.
+
+    Args:
+        share: The part of the steps over which it falls, above 0 and at most 1.
+        num_warmup_steps: LeRobot's base class declares it; this schedule has no warm-up.
+    """
+
+    share: float = 0.2
+    num_warmup_steps: int | None = None
+
+    def build(self, optimizer: torch.optim.Optimizer, num_training_steps: int) -> LambdaLR:
+        """The schedule over `num_training_steps` updates."""
+        falling = self.share * num_training_steps
+
+        def rate(step: int) -> float:
+            return min(1.0, max(0.0, (num_training_steps - step) / falling))
+
+        return LambdaLR(optimizer, rate)

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import draccus
 from lerobot.configs import PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig
 
 from lerobot_wm.constants import ACTION
 from lerobot_wm.policies.cameras import ImagePolicyConfig
@@ -47,7 +48,7 @@ class WorldModelConfig(ImagePolicyConfig, SingleFramesConfig):
         """
         self.choose_cameras()
 
-    def get_scheduler_preset(self) -> None:
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """A constant learning rate."""
         return None
 

@@ -31,7 +31,8 @@ class RSSMConfig:
             acted on, however small it is in the image. 0: no such head.
         image_shift: Pixels by which each training frame is shifted at random, up or down and left or right, before it
             is encoded; what is reconstructed is not shifted. Demonstrations of few goals can be told apart by what
-            else is in the image, to the pixel; once that moves, the goal has to be located.
+            else is in the image, to the pixel; once that moves, the goal has to be located. Not for actions that are
+            places in a fixed camera's image: the shift moves the place and not the action.
         predict_reward: Whether there is a reward head (turned off for datasets without `next.reward`).
         use_proprio: Encode and reconstruct proprioception beside the image (the paper's discarded variant).
         image_channels: Channels of the image; filled from the dataset.

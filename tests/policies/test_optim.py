@@ -1,0 +1,26 @@
+"""Learning-rate schedules."""
+
+import pytest
+import torch
+
+from lerobot_wm.policies.optim import FinalDecayConfig
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+
+
+def test_the_rate_is_constant_and_falls_to_zero_over_the_last_share_of_the_steps() -> None:
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=2.0)
+    schedule = FinalDecayConfig(share=0.5).build(optimizer, num_training_steps=8)
+    rates = []
+    for _ in range(8):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    assert rates == [2.0, 2.0, 2.0, 2.0, 2.0, 1.5, 1.0, 0.5]
+    assert optimizer.param_groups[0]["lr"] == 0.0
+
+
+def test_the_world_model_has_the_schedule_where_it_is_asked_for() -> None:
+    assert WMRSSMConfig(device="cpu").get_scheduler_preset() is None
+    assert WMRSSMConfig(device="cpu", lr_decay_share=0.2).get_scheduler_preset() == FinalDecayConfig(share=0.2)
+    with pytest.raises(ValueError, match=r"lr_decay_share is 1\.5; a share of the steps is between 0 and 1"):
+        WMRSSMConfig(device="cpu", lr_decay_share=1.5)
