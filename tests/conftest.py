@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -25,6 +25,13 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
+@pytest.fixture(autouse=True)
+def precision_of_one_test() -> Iterator[None]:
+    """Have accelerate forget the precision of a test's trainings: it keeps that of a process's first."""
+    yield
+    AcceleratorState._reset_state(True)
+
+
 def run_command(*arguments: str) -> None:
     """Run `lerobot-wm ARGUMENTS` in this process; arguments may hold several flags separated by spaces."""
     before = sys.argv
@@ -35,9 +42,8 @@ def run_command(*arguments: str) -> None:
         raise end.__cause__ or end from None  # the error that the command's one line was made of
     finally:
         sys.argv = before
-        AcceleratorState._reset_state(
-            True
-        )  # a process trains at one precision, but this one runs many commands
+        # A process trains at one precision, and a test runs several commands.
+        AcceleratorState._reset_state(True)
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,8 @@ def test_the_rate_is_constant_and_falls_to_zero_over_the_last_share_of_the_steps
 
 def test_the_world_model_has_the_schedule_where_it_is_asked_for() -> None:
     assert WMRSSMConfig(device="cpu").get_scheduler_preset() is None
-    assert WMRSSMConfig(device="cpu", lr_decay_share=0.2).get_scheduler_preset() == FinalDecayConfig(share=0.2)
+    assert WMRSSMConfig(device="cpu", lr_decay_share=0.2).get_scheduler_preset() == FinalDecayConfig(
+        share=0.2
+    )
     with pytest.raises(ValueError, match=r"lr_decay_share is 1\.5; a share of the steps is between 0 and 1"):
         WMRSSMConfig(device="cpu", lr_decay_share=1.5)
