@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from tests.faults.killing import WatchedCommands
 from tests.faults.running import Commands, Inputs, make_inputs
 from tests.recording import camera, vector
 
@@ -63,6 +64,14 @@ def dataset(whole_dataset: Path, tmp_path: Path) -> Path:
 def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Commands]:
     """Commands in processes of their own."""
     commands = Commands(tmp_path_factory.mktemp("printed"))
+    yield commands
+    commands.close()
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WatchedCommands]:
+    """Commands in processes of their own, whose writing is watched."""
+    commands = WatchedCommands(tmp_path_factory.mktemp("notes"))
     yield commands
     commands.close()
 

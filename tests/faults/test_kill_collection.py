@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -38,13 +37,6 @@ def contents(root: Path) -> dict[str, str]:
     record = json.loads((root / COLLECTION_RECORD).read_text())
     del record["seconds"]
     return {**digests(root), str(COLLECTION_RECORD): json.dumps(record)}
-
-
-@pytest.fixture(scope="module")
-def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WatchedCommands]:
-    commands = WatchedCommands(tmp_path_factory.mktemp("notes"))
-    yield commands
-    commands.close()
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import random
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +24,6 @@ WRITTEN_LAST = {"wm_rssm": "optimizer_param_groups.json", "wm_iql": "scheduler_s
 FINAL = Path("checkpoints") / "000006"
 LAST = Path("checkpoints") / "last" / "pretrained_model"
 KILLS = [1, pytest.param(20, marks=pytest.mark.slow)]
-
-
-@pytest.fixture(scope="module")
-def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WatchedCommands]:
-    commands = WatchedCommands(tmp_path_factory.mktemp("notes"))
-    yield commands
-    commands.close()
 
 
 @pytest.fixture(scope="module")
