@@ -2,7 +2,9 @@
 
 from typing import Any, Protocol
 
+import gymnasium as gym
 import numpy as np
+from aloha_script import HandOver
 
 
 class Script(Protocol):
@@ -10,9 +12,10 @@ class Script(Protocol):
 
     Args:
         rng: The source of all that is random in the episode.
+        env: The environment without its wrappers, as its reset has left it: to be read, not to be changed.
     """
 
-    def __init__(self, rng: np.random.Generator) -> None: ...
+    def __init__(self, rng: np.random.Generator, env: gym.Env) -> None: ...
 
     def __call__(self, state: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         """The next action (A,), for proprioception (P,) and what the environment says beside its observation."""
@@ -31,7 +34,7 @@ class PushToGoal:
     MAX_LEVER = 50.0
     NOISE = 10.0  # standard deviation of the noise on the target: no two episodes are alike
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: np.random.Generator, env: gym.Env) -> None:
         self._rng = rng
 
     def __call__(self, state: np.ndarray, info: dict[str, Any]) -> np.ndarray:
@@ -63,28 +66,8 @@ class PushToGoal:
         return centre + _rotated(np.array([1.1 * self.DETOUR, 0.0]), here + 0.6 * np.sign(rest))
 
 
-class Wander:
-    """ALOHA: every joint swings about the angle it starts from, at a pace and width of its own. No task is tried."""
-
-    GRIPPERS = (6, 13)  # which are open at 1 and closed at 0; the other actions are joint angles in radians
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self._width = rng.uniform(-0.4, 0.4, 14)
-        self._pace = rng.uniform(0.01, 0.04, 14)  # radians of the swing per step
-        self._start: np.ndarray | None = None
-        self._step = 0
-
-    def __call__(self, state: np.ndarray, info: dict[str, Any]) -> np.ndarray:
-        """The angles to go to, (14,)."""
-        if self._start is None:
-            self._start = state
-        self._step += 1
-        action = self._start + self._width * np.sin(self._pace * self._step)
-        action[list(self.GRIPPERS)] = action[list(self.GRIPPERS)].clip(0, 1)
-        return action
-
-
-SCRIPTS: dict[str, type[Script]] = {"pusht": PushToGoal, "aloha": Wander}
+# By the environment's --env.task.
+SCRIPTS: dict[str, type[Script]] = {"PushT-v0": PushToGoal, "AlohaTransferCube-v0": HandOver}
 
 
 def _rotated(vector: np.ndarray, angle: float) -> np.ndarray:

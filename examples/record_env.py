@@ -2,8 +2,8 @@
 
     python examples/record_env.py --env.type=pusht --repo_id=me/pusht --root=data/pusht --n_episodes=200
 
-PushT is pushed towards its goal by a rule of thumb that often succeeds. ALOHA's arms only wander: its package brings
-no demonstrator, and such data teach a world model how arms and camera go together, but no policy a task.
+PushT's block is pushed towards its goal by a rule of thumb that often succeeds. ALOHA's arms hand over the cube
+(--env.task=AlohaTransferCube-v0) by a plan that nearly always does.
 
 Frames hold what `lerobot-eval` gives a policy, under the same keys, and the reward, success and end that the action
 leads to, as in the Meta-World data of `lerobot-wm collect`.
@@ -89,18 +89,19 @@ def features(frame: dict[str, np.ndarray], action_dim: int) -> dict[str, dict[st
 
 
 def record_episode(
-    env: gym.vector.VectorEnv, process: Any, script: Script, seed: int
+    env: gym.vector.SyncVectorEnv, process: Any, script_type: type[Script], seed: int
 ) -> list[dict[str, Any]]:
     """The frames of one episode.
 
     Args:
         env: One environment, as LeRobot makes it.
         process: LeRobot's processor of its observations.
-        script: Acts.
-        seed: Of the environment.
+        script_type: Makes what acts in it.
+        seed: Of the environment and of the script.
     """
     frames = []
     raw, info = env.reset(seed=[seed])
+    script = script_type(np.random.default_rng(seed), env.envs[0].unwrapped)
     ended = False
     while not ended:
         frame = to_frame(raw, process)
@@ -124,12 +125,12 @@ def record(config: RecordConfig) -> None:
     """Record the dataset.
 
     Raises:
-        ValueError: There is no script for the environment in env_scripts.py.
+        ValueError: There is no script for the environment's task in env_scripts.py.
         FileExistsError: The dataset's folder is there already.
     """
-    if config.env.type not in SCRIPTS:
+    if config.env.task not in SCRIPTS:
         raise ValueError(
-            f"--env.type={config.env.type} has no script in examples/env_scripts.py, which has {', '.join(SCRIPTS)}: "
+            f"--env.task={config.env.task} has no script in examples/env_scripts.py, which has {', '.join(SCRIPTS)}: "
             "add one, or record what a policy does, by `lerobot-eval --eval.recording=true`."
         )
     if config.root.exists():
@@ -153,8 +154,7 @@ def record(config: RecordConfig) -> None:
             progress = trange(config.n_episodes, unit="episode")
             for episode in progress:
                 seed = config.seed + episode
-                script = SCRIPTS[config.env.type](np.random.default_rng(seed))
-                frames = record_episode(env, process, script, seed)
+                frames = record_episode(env, process, SCRIPTS[config.env.task], seed)
                 for frame in frames:
                     dataset.add_frame({**frame, "task": task})
                 dataset.save_episode()

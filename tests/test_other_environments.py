@@ -138,8 +138,8 @@ def test_the_script_pushes_the_block_to_its_goal(run_example: Callable[..., None
     env = gym.make("gym_pusht/PushT-v0", obs_type="state", max_episode_steps=300)
     coverage = []
     for seed in range(6):
-        script = push_to_goal(np.random.default_rng(seed))
         _, info = env.reset(seed=seed)
+        script = push_to_goal(np.random.default_rng(seed), env.unwrapped)
         best, ended = 0.0, False
         while not ended:
             batched = {key: info[key][None] for key in ("block_pose", "goal_pose")}
@@ -150,13 +150,40 @@ def test_the_script_pushes_the_block_to_its_goal(run_example: Callable[..., None
     assert np.mean(coverage) > 0.4  # random pushes: about 0.1
 
 
+def test_the_arms_hand_over_the_cube(
+    run_example: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs("gym_aloha")
+    import gymnasium as gym
+    from dm_control.mujoco.engine import Physics
+
+    # Drawing is nearly all the time an episode takes, and the script does not look.
+    monkeypatch.setattr(Physics, "render", lambda *args, **size: np.zeros((480, 640, 3), np.uint8))
+    monkeypatch.syspath_prepend(EXAMPLES)
+    hand_over = runpy.run_path(str(EXAMPLES / "aloha_script.py"))["HandOver"]
+    env = gym.make("gym_aloha/AlohaTransferCube-v0", obs_type="pixels_agent_pos", max_episode_steps=400)
+    actions, successes = [], 0
+    for seed in range(5):
+        observation, info = env.reset(seed=seed)
+        script, ended = hand_over(np.random.default_rng(seed), env.unwrapped), False
+        while not ended:
+            actions.append(script(observation["agent_pos"], info))
+            observation, _, terminated, truncated, info = env.step(actions[-1])
+            ended = terminated or truncated
+        successes += info["is_success"]
+    assert successes == 5
+    space = env.action_space
+    assert isinstance(space, gym.spaces.Box)
+    assert all(action.shape == space.shape for action in actions)
+
+
 @pytest.mark.parametrize(
     ("flags", "error", "message"),
     [
         (
-            "--env.type=metaworld",
+            "--env.type=aloha",  # LeRobot's own default task is another
             ValueError,
-            r"metaworld has no script in examples/env_scripts\.py.*pusht, aloha",
+            r"AlohaInsertion-v0 has no script in examples/env_scripts\.py.*PushT-v0, AlohaTransferCube-v0",
         ),
         ("--env.type=pusht", FileExistsError, r"is there already: choose another --root"),
     ],

@@ -23,10 +23,10 @@ def split_figure(records: list[Record]) -> Figure:
             rate = success_rate(r for r in of_arm if in_split(r, split))
             if rate is not None:
                 axes.plot(rate.interval, [row + shift] * 2, color=colour, linewidth=2, alpha=0.5)
-                axes.plot(rate.percent, row + shift, "o", color=colour, markersize=6)
+                axes.plot(rate.percent, row + shift, "o", color=colour, markersize=6, clip_on=False)
         axes.plot([], [], "o-", color=colour, label=split)
     axes.set_yticks(range(len(arms)), [short(arm) for arm in arms])
-    axes.invert_yaxis()
+    axes.set_ylim(len(arms) - 0.5, -0.5)  # first arm on top; whole rows, whatever is drawn in them
     axes.set_xlim(0, 100)
     axes.set_xlabel("success, % of rollouts over all tasks")
     axes.grid(axis="x", alpha=0.3)
