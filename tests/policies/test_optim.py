@@ -3,7 +3,10 @@
 import pytest
 import torch
 
+from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
+from lerobot_wm.policies.lr_decay import LRDecayConfig
 from lerobot_wm.policies.optim import FinalDecayConfig
+from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 
 
@@ -19,10 +22,11 @@ def test_the_rate_is_constant_and_falls_to_zero_over_the_last_share_of_the_steps
     assert optimizer.param_groups[0]["lr"] == 0.0
 
 
-def test_the_world_model_has_the_schedule_where_it_is_asked_for() -> None:
-    assert WMRSSMConfig(device="cpu").get_scheduler_preset() is None
-    assert WMRSSMConfig(device="cpu", lr_decay_share=0.2).get_scheduler_preset() == FinalDecayConfig(
+@pytest.mark.parametrize("config_class", [WMRSSMConfig, WMBCConfig, E2EBCConfig])
+def test_a_configuration_has_the_schedule_where_it_is_asked_for(config_class: type[LRDecayConfig]) -> None:
+    assert config_class(device="cpu").get_scheduler_preset() is None
+    assert config_class(device="cpu", lr_decay_share=0.2).get_scheduler_preset() == FinalDecayConfig(
         share=0.2
     )
     with pytest.raises(ValueError, match=r"lr_decay_share is 1\.5; a share of the steps is between 0 and 1"):
-        WMRSSMConfig(device="cpu", lr_decay_share=1.5)
+        config_class(device="cpu", lr_decay_share=1.5)

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_wm.policies.e2e_config import E2EConfig
+from lerobot_wm.policies.lr_decay import LRDecayConfig
 
 
 @PreTrainedConfig.register_subclass("e2e_bc")
 @dataclass
-class E2EBCConfig(E2EConfig):
+class E2EBCConfig(LRDecayConfig, E2EConfig):
     """Image encoder and two-layer MLP regressed on the demonstrated actions (paper section 3.2)."""

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
+from lerobot_wm.policies.lr_decay import LRDecayConfig
 
 
 @PreTrainedConfig.register_subclass("wm_bc")
 @dataclass
-class WMBCConfig(LatentPolicyConfig):
+class WMBCConfig(LRDecayConfig, LatentPolicyConfig):
     """Two-layer MLP regressed on the demonstrated actions (paper section 3.1.2)."""

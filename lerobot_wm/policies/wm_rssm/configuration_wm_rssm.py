@@ -8,7 +8,8 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.features import default_dtype, feature_dim
-from lerobot_wm.policies.optim import FinalDecayConfig, FusedAdamConfig
+from lerobot_wm.policies.lr_decay import LRDecayConfig
+from lerobot_wm.policies.optim import FusedAdamConfig
 from lerobot_wm.policies.rewards import RewardConfig
 from lerobot_wm.policies.world_model_config import WorldModelConfig
 from lerobot_wm.world_model.config import RSSMConfig
@@ -16,7 +17,7 @@ from lerobot_wm.world_model.config import RSSMConfig
 
 @PreTrainedConfig.register_subclass("wm_rssm")
 @dataclass
-class WMRSSMConfig(WorldModelConfig, RewardConfig):
+class WMRSSMConfig(LRDecayConfig, WorldModelConfig, RewardConfig):
     """The paper's RSSM, trained on windows of images and actions (section 3.1.1).
 
     Several cameras are one image of more channels to it. Its error is summed over them all, so that each camera adds
@@ -26,8 +27,6 @@ class WMRSSMConfig(WorldModelConfig, RewardConfig):
         rssm: Sizes and loss weights; its input sizes are filled from the dataset.
         window_length: Steps per training window T. A window starts at any frame from a zero state.
         lr: Learning rate of Adam.
-        lr_decay_share: Last part of the training's steps over which the learning rate falls linearly to zero; 0, as in
-            the paper: it stays as it is.
         grad_clip_norm: Joint gradient norm above which gradients are scaled down.
         dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in.
     """
@@ -38,7 +37,6 @@ class WMRSSMConfig(WorldModelConfig, RewardConfig):
     rssm: RSSMConfig = field(default_factory=RSSMConfig)
     window_length: int = 25
     lr: float = 6e-4
-    lr_decay_share: float = 0.0
     grad_clip_norm: float = 100.0
     dtype: str | None = None
 
@@ -46,10 +44,6 @@ class WMRSSMConfig(WorldModelConfig, RewardConfig):
         super().__post_init__()
         if self.window_length < 2:
             raise ValueError(f"window_length is {self.window_length}; a window needs at least 2 steps.")
-        if not 0 <= self.lr_decay_share <= 1:
-            raise ValueError(
-                f"lr_decay_share is {self.lr_decay_share:g}; a share of the steps is between 0 and 1."
-            )
         if self.dtype is None:
             self.dtype = default_dtype(str(self.device))
         self.drop_n_last_frames = self.window_length - 1  # no setting: read by LeRobot's sampler
@@ -117,7 +111,3 @@ class WMRSSMConfig(WorldModelConfig, RewardConfig):
     def get_optimizer_preset(self) -> FusedAdamConfig:
         """Adam 6e-4 with gradients clipped at 100, as in Dreamer V1 and TorchRL."""
         return FusedAdamConfig(lr=self.lr, grad_clip_norm=self.grad_clip_norm)
-
-    def get_scheduler_preset(self) -> FinalDecayConfig | None:
-        """A constant rate, with `lr_decay_share` until the last part of the steps."""
-        return FinalDecayConfig(share=self.lr_decay_share) if self.lr_decay_share else None
