@@ -130,10 +130,11 @@ def test_a_recording_is_what_the_environment_did(tmp_path: Path, run_example: Ca
     assert ends == [(True, False), (False, True)]  # one ended in success, the other by its time limit
 
 
-def test_the_script_pushes_the_block_to_its_goal(run_example: Callable[..., None]) -> None:
+def test_the_script_pushes_the_block_to_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
     needs("gym_pusht")
     import gymnasium as gym
 
+    monkeypatch.syspath_prepend(EXAMPLES)
     push_to_goal = runpy.run_path(str(EXAMPLES / "env_scripts.py"))["PushToGoal"]
     env = gym.make("gym_pusht/PushT-v0", obs_type="state", max_episode_steps=300)
     coverage = []
@@ -150,9 +151,7 @@ def test_the_script_pushes_the_block_to_its_goal(run_example: Callable[..., None
     assert np.mean(coverage) > 0.4  # random pushes: about 0.1
 
 
-def test_the_arms_hand_over_the_cube(
-    run_example: Callable[..., None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_arms_hand_over_the_cube(monkeypatch: pytest.MonkeyPatch) -> None:
     needs("gym_aloha")
     import gymnasium as gym
     from dm_control.mujoco.engine import Physics
