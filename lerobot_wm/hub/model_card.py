@@ -14,6 +14,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_wm.constants import ACTION, OBS_LATENT, OBS_STATE, TASK
 from lerobot_wm.data.fingerprint import dataset_fingerprint
 from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.hub.eval_command import eval_command
 from lerobot_wm.hub.markdown import Markdown, render
 from lerobot_wm.hub.train_command import train_command
 from lerobot_wm.nn.conv import IMAGE_SIZE
@@ -97,6 +98,7 @@ def model_card(
         module=policy_class.__module__,
         class_name=policy_class.__name__,
         example=Markdown(_example(config, settings)),
+        evaluation=None if makes_latents else Markdown(eval_command(config, repo_id)),
         action_shape=(1, *config.output_features[ACTION].shape),
         inputs=_inputs(config, settings),
         run=cfg,

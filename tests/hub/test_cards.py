@@ -10,7 +10,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies.factory import get_policy_class
 from markdown_it import MarkdownIt
 
+from lerobot_wm.constants import MT6
 from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.envs.tasks import task_description
+from lerobot_wm.hub.eval_command import eval_command
 from lerobot_wm.hub.markdown import code, escaped
 from lerobot_wm.hub.model_card import TrainingData, model_card
 from lerobot_wm.hub.train_command import train_command
@@ -102,6 +105,56 @@ def test_the_command_trains_the_same_and_tells_no_place(tmp_path: Path) -> None:
     assert train_command(run, None).startswith("lerobot-wm train --policy.path=CHECKPOINT ")
     run.resume = True
     assert train_command(run, None).startswith("lerobot-wm train --policy.type=wm_bc ")
+
+
+REACH, DOOR = "Reach a goal position", "Open a door with a revolving joint"
+META_WORLD = "lerobot-wm eval --policy.path=user/x --env.type=metaworld_mt"
+
+
+@pytest.mark.parametrize(
+    ("tasks", "cameras", "size", "command"),
+    [
+        ([REACH], ["observation.image"], 64, f"{META_WORLD} --env.task=reach-v3 --eval"),
+        (
+            [REACH, DOOR],
+            ["observation.images.hand_top", "observation.images.hand_side"],
+            64,
+            f"{META_WORLD} --env.task=reach-v3,door-open-v3 --env.camera_name=hand_top,hand_side --eval",
+        ),
+        (
+            [REACH],
+            ["observation.image"],
+            480,
+            f"{META_WORLD} --env.task=reach-v3 --env.image_size=480 --eval",
+        ),
+        (
+            [task_description(task) for task in MT6],
+            ["observation.image"],
+            64,
+            f"{META_WORLD} --env.task=mt6 --eval",
+        ),
+        (
+            ["Wipe"],
+            ["observation.image"],
+            64,
+            "lerobot-eval --policy.path=user/x --env.type=ENVIRONMENT --eval",
+        ),
+        (
+            [REACH],
+            ["observation.images.wrist"],
+            64,
+            "lerobot-eval --policy.path=user/x --env.type=ENVIRONMENT",
+        ),
+    ],
+)
+def test_the_command_evaluates_where_the_policy_was_trained(
+    tasks: list[str], cameras: list[str], size: int, command: str
+) -> None:
+    config = WMBCConfig(device="cpu", tasks=tasks)
+    config.input_features = {}
+    for camera in cameras:
+        config.input_features |= features("VISUAL", camera, (3, size, size))
+    assert eval_command(config, "user/x").startswith(command)
 
 
 @pytest.mark.parametrize(
