@@ -32,9 +32,8 @@ def eval_command(config: PreTrainedConfig, repo_id: str) -> str:
 
 def _metaworld_tasks(descriptions: list[str]) -> str | None:
     """The tasks' names, or their set's, as `--env.task` takes them; None where one is not Meta-World's."""
-    names = {
-        task_description(name): name for name in reversed(all_tasks())
-    }  # of two that share one, the first
+    # Of two tasks that share a description, the first.
+    names = {task_description(name): name for name in reversed(all_tasks())}
     if not descriptions or not set(descriptions) <= set(names):
         return None
     tasks = [names[description] for description in descriptions]
