@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import DONE, OBS_STATE, SUCCESS
 from lerobot_wm.policies.iql_config import IQLConfig
+from lerobot_wm.policies.parts import logged
 from lerobot_wm.policies.rewards import FrameLabel, reward_columns
 from lerobot_wm.rl.agent import IQLAgent
 
@@ -105,7 +106,7 @@ def batch_loss(
             `observation.state_is_pad` (B, 2) at t and t+1.
     """
     reward, terminal = outcomes(batch)  # (B,) each
-    return agent.loss(
+    loss, parts = agent.loss(
         observation,
         next_observation,
         action,
@@ -113,3 +114,4 @@ def batch_loss(
         terminal=terminal,
         has_next=~batch[f"{OBS_STATE}_is_pad"][:, 1],
     )
+    return loss, logged(parts)

@@ -7,6 +7,7 @@ from typing import Any
 
 from lerobot_wm.constants import OBS_ENV_STATE
 from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.compile import CompileConfig
 from lerobot_wm.policies.features import feature_dim
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
 from lerobot_wm.policies.multi_task_config import MultiTaskConfig
@@ -16,7 +17,7 @@ from lerobot_wm.world_model.config import RSSMConfig
 
 
 @dataclass
-class LatentPolicyConfig(ImagePolicyConfig, MultiTaskConfig):
+class LatentPolicyConfig(CompileConfig, ImagePolicyConfig, MultiTaskConfig):
     """A small multi-task policy on [latent, one-hot task, proprioception] (paper section 3.1.2).
 
     Args:

@@ -110,7 +110,7 @@ class IQLAgent(nn.Module):
         reward: Tensor,
         terminal: Tensor,
         has_next: Tensor,
-    ) -> tuple[Tensor, dict[str, float]]:
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Value, critic and actor losses on a batch of transitions.
 
         Args:
@@ -122,7 +122,8 @@ class IQLAgent(nn.Module):
             has_next: (B,) bool, False where the data ends at t and `next_observation` is no successor.
 
         Returns:
-            The sum of the losses and its parts by name; those of further actors are `actor_loss_beta<β>`.
+            The sum of the losses and its parts by name, each a detached scalar; those of further actors are
+            `actor_loss_beta<β>`.
         """
         with torch.no_grad():
             target_q = self.target_critic(observation, action).amin(0)  # (B,)
@@ -147,8 +148,8 @@ class IQLAgent(nn.Module):
             "advantage": advantage.mean(),
             "weight": iql.advantage_weight(advantage, self.betas[0]).mean(),
         }
-        values = torch.stack([*losses.values(), *monitors.values()]).tolist()  # one transfer from the device
-        return torch.stack(list(losses.values())).sum(), dict(zip([*losses, *monitors], values, strict=True))
+        parts = {name: value.detach() for name, value in (losses | monitors).items()}
+        return torch.stack(list(losses.values())).sum(), parts
 
     @torch.no_grad()
     def update_target(self) -> None:

@@ -35,9 +35,9 @@ def transitions(seed: int) -> dict[str, Tensor]:
     }
 
 
-def train(agent: IQLAgent, steps: int) -> dict[str, float]:
+def train(agent: IQLAgent, steps: int) -> dict[str, Tensor]:
     optimizer = torch.optim.Adam(agent.param_groups(), lr=1e-2)
-    parts: dict[str, float] = {}
+    parts: dict[str, Tensor] = {}
     for step in range(steps):
         loss, parts = agent.loss(**transitions(step))
         optimizer.zero_grad()
@@ -50,7 +50,7 @@ def train(agent: IQLAgent, steps: int) -> dict[str, float]:
 def test_the_sum_of_the_parts_is_the_loss() -> None:
     loss, parts = make_agent([0.5, 3.0]).loss(**transitions(0))
     names = ("value_loss", "critic_loss", "actor_loss", "actor_loss_beta3")
-    assert loss.item() == pytest.approx(sum(parts[name] for name in names), rel=1e-6)
+    assert loss.item() == pytest.approx(sum(parts[name].item() for name in names), rel=1e-6)
 
 
 def test_further_actors_leave_the_main_one_and_the_critics_untouched() -> None:
@@ -67,7 +67,7 @@ def test_beta_zero_is_behaviour_cloning_by_likelihood() -> None:
     _, parts = agent.loss(**batch)
     mean, log_std = agent.actors[1](batch["observation"])
     likelihood = iql.gaussian_log_prob(mean, log_std, batch["action"]).mean()
-    assert parts["actor_loss_beta0"] == pytest.approx(-likelihood.item(), rel=1e-6)
+    assert parts["actor_loss_beta0"].item() == pytest.approx(-likelihood.item(), rel=1e-6)
 
 
 def test_beta_chooses_the_actor() -> None:
@@ -135,7 +135,9 @@ def test_only_frames_with_a_successor_or_success_train_the_critics() -> None:
     assert agent.loss(**{**batch, "terminal": never})[1]["critic_loss"] == 0
     _, parts = agent.loss(**{**batch, "terminal": always})
     qs = agent.critic(batch["observation"], batch["action"])
-    assert parts["critic_loss"] == pytest.approx(2 * (qs - batch["reward"]).square().mean().item(), rel=1e-5)
+    assert parts["critic_loss"].item() == pytest.approx(
+        2 * (qs - batch["reward"]).square().mean().item(), rel=1e-5
+    )
 
 
 def test_every_trained_parameter_is_in_one_group_and_the_actors_come_first() -> None:

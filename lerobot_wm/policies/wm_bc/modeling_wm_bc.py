@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.policies.compile import compiled
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.rl.bc import bc_loss
@@ -22,6 +23,7 @@ class WMBCPolicy(LatentPolicy):
         self.actor = MLP(
             config.observation_dim, config.hidden_dims, config.action_dim, nn.ReLU, config.dropout
         )
+        self._loss = compiled(self.loss) if config.compile_model else self.loss
 
     def get_optim_params(self) -> dict:
         """The actor's parameters: the world model is frozen."""
@@ -47,4 +49,8 @@ class WMBCPolicy(LatentPolicy):
         """
         tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
         observation = self.observation_at(batch, tasks)  # (B, O)
-        return bc_loss(self.actor(observation), self.action_scaling(batch[ACTION])), {}
+        return self._loss(observation, self.action_scaling(batch[ACTION])), {}
+
+    def loss(self, observation: Tensor, action: Tensor) -> Tensor:
+        """The scalar loss for observations (B, O) and scaled actions (B, A)."""
+        return bc_loss(self.actor(observation), action)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.policies.compile import compiled
 from lerobot_wm.policies.iql_agent import Outcomes, batch_loss, make_agent
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
@@ -27,6 +28,8 @@ class WMIQLPolicy(LatentPolicy):
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
         self.agent = make_agent(config, config.observation_dim)
+        if config.compile_model:
+            self.agent.loss = compiled(self.agent.loss)  # type: ignore[method-assign]
         self.outcomes = Outcomes(config, dataset_meta)
 
     def get_optim_params(self) -> dict:

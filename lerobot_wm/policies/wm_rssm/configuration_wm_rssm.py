@@ -7,6 +7,7 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.conv import IMAGE_SIZE
+from lerobot_wm.policies.compile import CompileConfig
 from lerobot_wm.policies.features import default_dtype, feature_dim
 from lerobot_wm.policies.lr_decay import LRDecayConfig
 from lerobot_wm.policies.optim import FusedAdamConfig
@@ -17,7 +18,7 @@ from lerobot_wm.world_model.config import RSSMConfig
 
 @PreTrainedConfig.register_subclass("wm_rssm")
 @dataclass
-class WMRSSMConfig(LRDecayConfig, WorldModelConfig, RewardConfig):
+class WMRSSMConfig(LRDecayConfig, CompileConfig, WorldModelConfig, RewardConfig):
     """The paper's RSSM, trained on windows of images and actions (section 3.1.1).
 
     Several cameras are one image of more channels to it. Its error is summed over them all, so that each camera adds

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
 from lerobot_wm.policies.cameras import camera_images
+from lerobot_wm.policies.compile import compiled
 from lerobot_wm.policies.features import stat
+from lerobot_wm.policies.parts import logged
 from lerobot_wm.policies.rewards import FrameLabel, reward_columns
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.world_model_policy import WorldModelPolicy
@@ -41,6 +43,11 @@ class WMRSSMPolicy(WorldModelPolicy):
                     config.rssm.predict_reward = False  # without the head; a checkpoint's stays as it was
         self.rewards = FrameLabel(config.reward_key, dataset_meta)
         self.world_model = WorldModel(config.rssm)
+        if (
+            config.compile_model and dataset_meta is not None
+        ):  # to be trained: episodes have all kinds of lengths
+            rssm = self.world_model.rssm
+            rssm.observe = compiled(rssm.observe)  # type: ignore[method-assign]
         if dataset_stats is not None:  # a checkpoint's own values replace these when it is loaded
             self.world_model.action_scaling.set_range(
                 stat(dataset_stats, ACTION, "min"), stat(dataset_stats, ACTION, "max")
@@ -84,5 +91,4 @@ class WMRSSMPolicy(WorldModelPolicy):
             rewards=self.rewards(batch, batch[ACTION].shape[1]) if self._learns_reward else None,
             proprio=batch[OBS_STATE] if rssm.use_proprio else None,
         )
-        values = torch.stack(list(parts.values())).tolist()  # one transfer from the device for all of them
-        return loss, dict(zip(parts, values, strict=True))
+        return loss, logged(parts)
