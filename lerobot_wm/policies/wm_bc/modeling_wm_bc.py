@@ -23,7 +23,8 @@ class WMBCPolicy(LatentPolicy):
         self.actor = MLP(
             config.observation_dim, config.hidden_dims, config.action_dim, nn.ReLU, config.dropout
         )
-        self._loss = compiled(self.loss) if config.compile_model else self.loss
+        if config.compile_model:
+            self.loss = compiled(self.loss)  # type: ignore[method-assign]
 
     def get_optim_params(self) -> dict:
         """The actor's parameters: the world model is frozen."""
@@ -49,7 +50,7 @@ class WMBCPolicy(LatentPolicy):
         """
         tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
         observation = self.observation_at(batch, tasks)  # (B, O)
-        return self._loss(observation, self.action_scaling(batch[ACTION])), {}
+        return self.loss(observation, self.action_scaling(batch[ACTION])), {}
 
     def loss(self, observation: Tensor, action: Tensor) -> Tensor:
         """The scalar loss for observations (B, O) and scaled actions (B, A)."""

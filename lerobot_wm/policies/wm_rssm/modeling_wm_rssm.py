@@ -43,9 +43,8 @@ class WMRSSMPolicy(WorldModelPolicy):
                     config.rssm.predict_reward = False  # without the head; a checkpoint's stays as it was
         self.rewards = FrameLabel(config.reward_key, dataset_meta)
         self.world_model = WorldModel(config.rssm)
-        if (
-            config.compile_model and dataset_meta is not None
-        ):  # to be trained: episodes have all kinds of lengths
+        # Only to be trained: a filter's episodes have all kinds of lengths, and each would be compiled anew.
+        if config.compile_model and dataset_meta is not None:
             rssm = self.world_model.rssm
             rssm.observe = compiled(rssm.observe)  # type: ignore[method-assign]
         if dataset_stats is not None:  # a checkpoint's own values replace these when it is loaded
