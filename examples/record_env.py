@@ -146,7 +146,7 @@ def record(config: RecordConfig) -> None:
         robot_type=config.env.type,
         features=features(to_frame(first, process), env.single_action_space.shape[0]),
         # LeRobot's default halves the resolution of colour, in which small things are lost.
-        rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=10),
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=10, extra_options={"mbtree": 0}),
     )
     successes = 0
     try:
