@@ -6,12 +6,13 @@ from pathlib import Path
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.sampler import EpisodeAwareSampler
-from torch.utils.data import DataLoader
+from torch.utils.data import BatchSampler, DataLoader
 
 from benchmarks.data import REPO_ID, demonstrations, latents
 from benchmarks.timing import Prepared, rate
 from lerobot_wm.constants import ACTION, FPS, OBS_IMAGE, OBS_LATENT, OBS_STATE, REWARD
 from lerobot_wm.data.loader import RamLoader
+from lerobot_wm.data.order import EpochOrder
 
 CPU = torch.device("cpu")
 
@@ -66,12 +67,12 @@ def _transitions(folder: Path, episodes_per_task: int, batch: int, workers: int)
 class _Endless:
     """A sampler's epochs, one after the other: `lerobot-train` too keeps its workers from epoch to epoch."""
 
-    def __init__(self, sampler: EpisodeAwareSampler) -> None:
-        self._sampler = sampler
+    def __init__(self, sampler: EpisodeAwareSampler | EpochOrder) -> None:
+        self.sampler = sampler
 
     def __iter__(self) -> Iterator[int]:
         while True:
-            yield from self._sampler
+            yield from self.sampler
 
 
 def _loader(dataset: LeRobotDataset, batch: int, workers: int, drop_n_last_frames: int = 0) -> DataLoader:
@@ -87,8 +88,12 @@ def _loader(dataset: LeRobotDataset, batch: int, workers: int, drop_n_last_frame
 
 
 def _in_ram(loader: DataLoader) -> RamLoader:
-    assert loader.batch_sampler is not None  # only a loader of an iterable dataset has none
-    return RamLoader(loader, loader.batch_sampler, CPU)
+    # As in `lerobot-wm train`: the same samples in the same order, looked up epoch by epoch.
+    assert isinstance(loader.sampler, _Endless)
+    assert isinstance(loader.sampler.sampler, EpisodeAwareSampler)
+    assert loader.batch_size is not None
+    order = _Endless(EpochOrder(loader.sampler.sampler))
+    return RamLoader(loader, BatchSampler(order, loader.batch_size, drop_last=False), CPU)
 
 
 def _prepared(loader: DataLoader | RamLoader, workers: int, seconds: float, per_batch: int = 1) -> Prepared:

@@ -13,6 +13,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from torch import Tensor
 
 from lerobot_wm.data.loader import RamLoader
+from lerobot_wm.data.order import batches_of_rows
 from lerobot_wm.pipeline.divergence import LossWatch
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 
@@ -57,7 +58,7 @@ class RamAccelerator(Accelerator):
         Step k of W processes reads batches kW to kW + W - 1 of the epoch, one each: together the batch of one process
         with a W times larger batch size. An epoch's last step is filled up with the epoch's first samples.
         """
-        batch_sampler = data_loader.batch_sampler
+        batch_sampler = batches_of_rows(data_loader)
         if self.num_processes > 1:
             batch_sampler = BatchSamplerShard(batch_sampler, self.num_processes, self.process_index)
         with self.in_turn():  # the first decodes the frames, the others map them

@@ -146,7 +146,7 @@ def test_fingerprint_changes_with_content(demos_root: Path, tmp_path: Path) -> N
     assert dataset_fingerprint(copy) != dataset_fingerprint(demos_root)
 
 
-def test_slices_equal_fancy_indexing() -> None:
+def test_gathering_equals_indexing() -> None:
     source = torch.arange(60).reshape(20, 3)
     runs = torch.tensor([[0, 1, 2], [17, 18, 19]])
     repeats = torch.tensor([[0, 0, 1], [5, 4, 3]])
