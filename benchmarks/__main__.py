@@ -14,7 +14,7 @@ from rich.console import Console
 from benchmarks.environments import ROOT
 from benchmarks.measure import Result, measure_row
 from benchmarks.rows import ROWS, Row
-from benchmarks.table import WIDTH, results_table, rows_table, size_text
+from benchmarks.table import WIDTH, markdown_table, results_table, rows_table, size_text
 from lerobot_wm.cores import usable_cores
 from lerobot_wm.report.provenance import provenance
 
@@ -77,7 +77,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 
 
 def write(results: list[Result], path: Path) -> None:
-    """Put results into the file, in place of earlier ones of the same row, size and peer."""
+    """Put results into the file, in place of earlier ones of the same row, size and peer; and its table beside it."""
 
     def key(entry: dict[str, Any]) -> tuple[str, str, str | None]:
         return entry["row"], json.dumps(entry["sizes"], sort_keys=True), entry["peer_name"]
@@ -88,6 +88,7 @@ def write(results: list[Result], path: Path) -> None:
     partial = path.with_suffix(".part")
     partial.write_text(json.dumps(list(kept.values()), indent=1) + "\n")
     partial.replace(path)
+    path.with_suffix(".md").write_text(markdown_table(kept.values()))
 
 
 def main(arguments: list[str]) -> int:

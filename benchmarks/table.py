@@ -1,12 +1,13 @@
-"""Rows and results as tables of 100 columns."""
+"""Rows and results as tables: of 100 columns, and in Markdown."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from rich.table import Table
 
 from benchmarks.environments import OWN
 from benchmarks.measure import Result
-from benchmarks.rows import Row, Size
+from benchmarks.rows import ROWS, Row, Size
 
 WIDTH = 100
 
@@ -47,6 +48,20 @@ def results_table(results: Iterable[Result]) -> Table:
     return table
 
 
+def markdown_table(entries: Iterable[Mapping[str, Any]]) -> str:
+    """The entries of a results file (`Result` as dicts), in the order of the rows, one line each."""
+    titles = {row.name: f"{row.title}; {row.unit}" for row in ROWS}
+    lines = ["| row | size | against | ours | peer | times faster |", "|---|---|---|---:|---:|---:|"]
+    for entry in sorted(entries, key=lambda entry: list(titles).index(entry["row"])):
+        peer, ratio = "", ""
+        if entry["ratio"] is not None:
+            peer, ratio = _range(entry["peer"], entry["spread"]["peer"]), number(entry["ratio"])
+        ours = _range(entry["ours"], entry["spread"]["ours"])
+        cells = (titles[entry["row"]], size_text(entry["sizes"]), entry["peer_name"] or "", ours, peer, ratio)
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
 def rows_table(rows: Iterable[Row], scale: float) -> Table:
     """What can be measured, at which sizes, and the environment each peer needs."""
     table = Table(width=WIDTH)
@@ -63,8 +78,12 @@ def rows_table(rows: Iterable[Row], scale: float) -> Table:
 
 
 def _spread(median: float, ends: list[float]) -> str:
+    return _range(median, ends).replace(" ", "\n", 1)
+
+
+def _range(median: float, ends: list[float]) -> str:
     low, high = ends
-    return f"{number(median)}\n[{number(low)}, {number(high)}]"
+    return f"{number(median)} [{number(low)}, {number(high)}]"
 
 
 def _needs(environment: str) -> str:
