@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from lerobot_wm.nn.dropout import Dropout
+
 
 class MLP(nn.Module):
     """Hidden layers with an activation (and dropout) after each, then a linear output layer.
@@ -33,7 +35,7 @@ class MLP(nn.Module):
         for hidden_dim in hidden_dims:
             layers += [nn.Linear(input_dim, hidden_dim), activation()]
             if dropout > 0:
-                layers.append(nn.Dropout(dropout))
+                layers.append(Dropout(dropout))
             input_dim = hidden_dim
         self.trunk = nn.Sequential(*layers)
         self.head = nn.Linear(input_dim, output_dim)
