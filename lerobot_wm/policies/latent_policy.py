@@ -39,7 +39,9 @@ class LatentPolicy(MultiTaskPolicy):
             check_latents(config, dataset_meta)
         super().__init__(config, dataset_stats, dataset_meta)
         if world_model is not None:
-            self.world_model = world_model.requires_grad_(False)
+            # Laid out like the images it gets: else each decision lays out all its weights anew, which takes longer than
+            # all else.
+            self.world_model = world_model.requires_grad_(False).to(memory_format=torch.channels_last)
         if config.scales_latents:
             self.latent_scaling = Affine(config.latent_dim)
             if dataset_stats is not None:

@@ -72,6 +72,13 @@ def test_latent_dataset_keeps_everything_but_the_images(demos: LeRobotDataset, l
     assert not record.sampled
 
 
+def test_the_frozen_world_model_is_laid_out_like_its_images(policy_paths: dict[str, Path]) -> None:
+    """Else each decision copies all of its weights, which takes longer than all else."""
+    weights = [weight for weight in load(policy_paths, "wm_bc").world_model.parameters() if weight.ndim == 4]
+    assert weights
+    assert all(weight.is_contiguous(memory_format=torch.channels_last) for weight in weights)
+
+
 @pytest.mark.parametrize("policy_type", POLICY_TYPES)
 def test_checkpoint_is_self_contained(
     policy_type: str,
