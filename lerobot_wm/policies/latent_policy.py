@@ -39,8 +39,7 @@ class LatentPolicy(MultiTaskPolicy):
             check_latents(config, dataset_meta)
         super().__init__(config, dataset_stats, dataset_meta)
         if world_model is not None:
-            # Laid out like the images it gets: else each decision lays out all its weights anew, which takes longer than
-            # all else.
+            # Laid out like the images it gets: else each decision copies all of its weights, most of its time.
             self.world_model = world_model.requires_grad_(False).to(memory_format=torch.channels_last)
         if config.scales_latents:
             self.latent_scaling = Affine(config.latent_dim)
