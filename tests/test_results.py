@@ -1,4 +1,4 @@
-"""The success rates that README.md shows are those of the committed rollouts."""
+"""The success rates that README.md shows are those of the committed rollouts, its speeds those measured."""
 
 from pathlib import Path
 
@@ -37,3 +37,17 @@ def test_readme_shows_the_committed_rollouts(preset: str) -> None:
     assert table
     for arm, cells in table.items():
         assert cells == expected([record for record in records if record["arm"] == arm]), arm
+
+
+def test_readme_shows_the_committed_measurements() -> None:
+    """Peer, ours, peer's, ratio: the cells of a line are those of one line of the whole table."""
+
+    def cells(line: str) -> list[str]:
+        return [cell.strip() for cell in line.split("|")[1:-1]]
+
+    whole = (ROOT / "results" / "benchmarks" / "cpu2.md").read_text().splitlines()[2:]
+    measured = {tuple(cells(line)[2:]) for line in whole}
+    section = (ROOT / "README.md").read_text().split("\n## Speed\n")[1].split("\n## ")[0]
+    shown = [tuple(cells(line)[1:]) for line in section.splitlines() if line.startswith("|")][2:]
+    assert len(shown) > 10
+    assert set(shown) <= measured
