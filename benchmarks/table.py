@@ -50,14 +50,17 @@ def results_table(results: Iterable[Result]) -> Table:
 
 def markdown_table(entries: Iterable[Mapping[str, Any]]) -> str:
     """The entries of a results file (`Result` as dicts), in the order of the rows, one line each."""
-    titles = {row.name: f"{row.title}; {row.unit}" for row in ROWS}
+    titles = {row.name: row.title for row in ROWS}
+    order = list(titles)
     lines = ["| row | size | against | ours | peer | times faster |", "|---|---|---|---:|---:|---:|"]
-    for entry in sorted(entries, key=lambda entry: list(titles).index(entry["row"])):
+    # A row that is measured no longer is called what it was called, and comes last.
+    for entry in sorted(entries, key=lambda e: order.index(e["row"]) if e["row"] in titles else len(order)):
+        title = f"{titles.get(entry['row'], entry['row'])}; {entry['unit']}"
         peer, ratio = "", ""
         if entry["ratio"] is not None:
             peer, ratio = _range(entry["peer"], entry["spread"]["peer"]), number(entry["ratio"])
         ours = _range(entry["ours"], entry["spread"]["ours"])
-        cells = (titles[entry["row"]], size_text(entry["sizes"]), entry["peer_name"] or "", ours, peer, ratio)
+        cells = (title, size_text(entry["sizes"]), entry["peer_name"] or "", ours, peer, ratio)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

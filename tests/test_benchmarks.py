@@ -106,6 +106,11 @@ def test_command_prints_and_merges_into_its_file(
         == f"python -m benchmarks --rows=row --repeats=1 --output={output}"
     )
     assert {"torch", "CPU cores"} <= results[0]["provenance"].keys()
+    table = output.with_suffix(".md").read_text().splitlines()
+    assert len(table) == 2 + len(results)
+    cells = [cell.strip() for cell in table[2].split("|")[1:-1]]
+    assert cells[0] == "row; steps/s"
+    assert cells[2:] == ["peer", "10.0 [10.0, 10.0]", "5.00 [5.00, 5.00]", "2.00"]
     printed = capsys.readouterr().out
     assert "[4.00, 6.00]" in printed
     assert max(map(len, printed.splitlines())) <= 100

@@ -40,7 +40,8 @@ class LatentPolicy(MultiTaskPolicy):
         super().__init__(config, dataset_stats, dataset_meta)
         if world_model is not None:
             # Laid out like the images it gets: else each decision copies all of its weights, most of its time.
-            self.world_model = world_model.requires_grad_(False).to(memory_format=torch.channels_last)
+            self.world_model = world_model.requires_grad_(False)
+            self.world_model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # its stub lacks it
         if config.scales_latents:
             self.latent_scaling = Affine(config.latent_dim)
             if dataset_stats is not None:
