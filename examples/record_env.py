@@ -145,7 +145,8 @@ def record(config: RecordConfig) -> None:
         root=config.root,
         robot_type=config.env.type,
         features=features(to_frame(first, process), env.single_action_space.shape[0]),
-        # LeRobot's default halves the resolution of colour, in which small things are lost.
+        # LeRobot's default halves the resolution of colour, in which small things are lost; with x264's mbtree the same
+        # frames do not always give the same video.
         rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=10, extra_options={"mbtree": 0}),
     )
     successes = 0

@@ -142,7 +142,7 @@ def _create_dataset(root: Path, shard: Shard) -> LeRobotDataset:
         robot_type=ROBOT_TYPE,
         features=metaworld_features(shard.image_size, image_features(shard.cameras).values()),
         # Full chroma resolution: with yuv420p the 3-pixel red dot that marks reach-v3's goal is lost.
-        # Without mbtree: with it x264, given the same frames, now and then writes other ones (7 of 100 shards of two
+        # Without mbtree: with it x264, given the same frames, now and then writes other ones (25 of 600 shards of two
         # episodes on a busy machine; none of 400 without).
         rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=10, extra_options={"mbtree": 0}),
         streaming_encoding=True,
