@@ -9,8 +9,10 @@ from typing import Any
 
 from accelerate import Accelerator, DistributedDataParallelKwargs, InitProcessGroupKwargs
 from accelerate.data_loader import BatchSamplerShard
+from accelerate.utils import DistributedType
 from lerobot.configs.train import TrainPipelineConfig
 from torch import Tensor
+from torch.optim import Optimizer
 
 from lerobot_wm.data.loader import RamLoader
 from lerobot_wm.data.order import batches_of_rows
@@ -40,6 +42,27 @@ class RamAccelerator(Accelerator):
         prepared = super().prepare_model(model, *args, **kwargs)
         self._watch.attach(prepared)
         return prepared
+
+    def prepare_optimizer(self, optimizer: Optimizer, device_placement: bool | None = None) -> Any:
+        """Prepare the optimizer as accelerate does, past whose wrapper it steps where that adds nothing.
+
+        It searches the disk for the package of another optimizer twice a step: of a small policy's steps a tenth.
+        """
+        prepared = super().prepare_optimizer(optimizer, device_placement)
+        if self.scaler is None:
+            prepared.step, prepared.zero_grad = optimizer.step, optimizer.zero_grad
+        return prepared
+
+    def unwrap_model(
+        self, model: Any, keep_fp32_wrapper: bool = True, keep_torch_compile: bool = True
+    ) -> Any:
+        """Unwrap as accelerate does, without its walk through all modules where nothing can be wrapped.
+
+        LeRobot unwraps the policy at every step.
+        """
+        if self.distributed_type == DistributedType.NO and keep_fp32_wrapper and keep_torch_compile:
+            return model
+        return super().unwrap_model(model, keep_fp32_wrapper, keep_torch_compile)
 
     def backward(self, loss: Tensor, **kwargs: Any) -> None:
         """Go backward as accelerate does, and stop the training where that gives no finite gradient.

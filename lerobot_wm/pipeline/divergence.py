@@ -20,11 +20,13 @@ class LossWatch:
 
     def __init__(self) -> None:
         self._parts: dict[str, Any] = {}
-        self._model = nn.Module()
+        self._trained: list[tuple[str, nn.Parameter]] = []
 
     def attach(self, model: nn.Module) -> None:
         """Follow a LeRobot policy, prepared for training; its `forward` returns the loss and its parts by name."""
-        self._model = model
+        self._trained = [
+            (name, parameter) for name, parameter in model.named_parameters() if parameter.requires_grad
+        ]
         model.forward = self._noting(model.forward)  # LeRobot calls it by name, past the hooks of modules
 
     def _noting(self, forward: Callable[..., Any]) -> Callable[..., Any]:
@@ -49,7 +51,7 @@ class LossWatch:
         Raises:
             DivergenceError: The loss or a gradient is not finite.
         """
-        gradients = [parameter.grad for parameter in self._model.parameters() if parameter.grad is not None]
+        gradients = [parameter.grad for _, parameter in self._trained if parameter.grad is not None]
         norm = torch.nn.utils.get_total_norm(gradients)
         if bool((loss.detach() + norm).isfinite()):
             return
@@ -71,6 +73,6 @@ class LossWatch:
                 yield f"the loss's part '{name}'"
 
     def _broken_gradients(self) -> Iterator[str]:
-        for name, parameter in self._model.named_parameters():
+        for name, parameter in self._trained:
             if parameter.grad is not None and not parameter.grad.isfinite().all():
                 yield name

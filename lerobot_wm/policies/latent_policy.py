@@ -40,7 +40,7 @@ class LatentPolicy(MultiTaskPolicy):
         super().__init__(config, dataset_stats, dataset_meta)
         if world_model is not None:
             # Laid out like the images it gets: else each decision copies all of its weights, most of its time.
-            self.world_model = world_model.requires_grad_(False)
+            self.world_model = world_model.requires_grad_(False).eval()
             self.world_model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # its stub lacks it
         if config.scales_latents:
             self.latent_scaling = Affine(config.latent_dim)
@@ -62,10 +62,14 @@ class LatentPolicy(MultiTaskPolicy):
         return self.config.latent_dim
 
     def train(self, mode: bool = True) -> "LatentPolicy":
-        """Switch training mode; the frozen world model stays in evaluation mode."""
-        super().train(mode)
-        if self.config.use_latent:
-            self.world_model.eval()
+        """Switch training mode; the frozen world model stays in evaluation mode.
+
+        LeRobot does so at every step, for which the many modules of the world model are passed over.
+        """
+        self.training = mode
+        for name, module in self.named_children():
+            if name != "world_model":
+                module.train(mode)
         return self
 
     def observation(

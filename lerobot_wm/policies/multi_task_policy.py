@@ -118,7 +118,8 @@ class MultiTaskPolicy(StrictPolicy):
                 "letter by letter (by --task for lerobot-rollout)."
             )
         self.config.check_tasks(names)
-        index = torch.tensor([known.index(name) for name in names], device=self.state_scaling.offset.device)
+        places = {task: place for place, task in enumerate(known)}
+        index = torch.tensor([places[name] for name in names], device=self.state_scaling.offset.device)
         return nn.functional.one_hot(index, len(known)).float()
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:

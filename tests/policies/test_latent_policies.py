@@ -102,6 +102,18 @@ def test_checkpoint_is_self_contained(
 
 
 @pytest.mark.parametrize("policy_type", POLICY_TYPES)
+def test_the_heads_alone_are_switched_to_training(policy_type: str, policy_paths: dict[str, Path]) -> None:
+    policy = load(policy_paths, policy_type)
+    for mode in (True, False):
+        policy.train(mode)
+        modes = {name.split(".")[0]: module.training for name, module in policy.named_modules() if name}
+        assert policy.training == mode
+        assert modes.pop("world_model") is False
+        assert set(modes.values()) == {mode}
+    assert not any(module.training for module in policy.train().world_model.modules())
+
+
+@pytest.mark.parametrize("policy_type", POLICY_TYPES)
 def test_a_second_episode_equals_a_fresh_one(
     policy_type: str, policy_paths: dict[str, Path], demos: LeRobotDataset
 ) -> None:

@@ -1,0 +1,52 @@
+from pathlib import Path
+
+import pytest
+import torch
+from accelerate import Accelerator
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from torch import Tensor, nn
+
+from lerobot_wm.pipeline.accelerator import RamAccelerator, make_accelerator
+from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
+
+
+class Line(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.slope = nn.Parameter(torch.ones(()))
+
+    def forward(self, x: Tensor) -> tuple[Tensor, dict[str, float]]:
+        return (self.slope * x).square(), {}
+
+
+@pytest.fixture
+def accelerator(tmp_path: Path) -> RamAccelerator:
+    policy = E2EBCConfig(device="cpu", dtype="float32", push_to_hub=False)
+    return make_accelerator(
+        TrainPipelineConfig(DatasetConfig("test/demos"), policy=policy, output_dir=tmp_path)
+    )
+
+
+def test_a_step_is_the_optimizers_own(accelerator: RamAccelerator, monkeypatch: pytest.MonkeyPatch) -> None:
+    def search() -> bool:
+        raise AssertionError("a step searches the disk")
+
+    model = Line()
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.5**step)
+    prepared, stepper, scheduler = accelerator.prepare(model, optimizer, schedule)
+    monkeypatch.setattr("accelerate.optimizer.is_lomo_available", search)
+    for rate, slope in ((0.1, 0.8), (0.05, 0.72)):
+        assert stepper.param_groups[0]["lr"] == rate
+        prepared.forward(torch.ones(()))[0].backward()
+        stepper.step()
+        stepper.zero_grad()
+        scheduler.step()
+        assert model.slope.item() == pytest.approx(slope)
+        assert model.slope.grad is None
+
+
+def test_unwrapping_gives_what_accelerate_gives(accelerator: RamAccelerator) -> None:
+    prepared = accelerator.prepare(Line())
+    assert accelerator.unwrap_model(prepared) is Accelerator.unwrap_model(accelerator, prepared)
