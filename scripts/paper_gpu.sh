@@ -5,17 +5,22 @@
 #   scripts/paper_gpu.sh          the preset `paper`
 #   scripts/paper_gpu.sh smoke    the same path in minutes on two CPU cores
 #
-# The work goes to outputs/<preset>, what is worth keeping to $OUT (outputs/paper_gpu by default). Called again it
-# goes on where it stopped. PYTHON names an interpreter that has the project installed, to use in place of .venv.
+# The work goes to outputs/<preset>, what is worth keeping to $OUT (outputs/paper_gpu/<preset> by default). Called again
+# it goes on where it stopped. PYTHON names an interpreter that has the project installed, to use in place of .venv.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 unset PYTHONDONTWRITEBYTECODE
 
 PRESET="${1:-paper}"
-OUT="${OUT:-outputs/paper_gpu}"
+OUT="${OUT:-outputs/paper_gpu/$PRESET}"
 if [[ -z "${PYTHON:-}" ]]; then
   bash scripts/setup.sh
   PYTHON=.venv/bin/python
+fi
+if [[ "$PRESET" != smoke ]] && ! "$PYTHON" -c "import sys, torch; sys.exit(not torch.cuda.is_available())"; then
+  "$PYTHON" -m lerobot_wm.cli doctor || true
+  echo "PyTorch finds no GPU, on which the preset '$PRESET' takes minutes and without one days: see above." >&2
+  exit 1
 fi
 mkdir -p "$OUT"
 
@@ -28,14 +33,18 @@ for file in records.jsonl times.json report/index.html report/success.md report/
     cp "outputs/$PRESET/$file" "$OUT/"
   fi
 done
-"$PYTHON" - "$PRESET" "$SECONDS" >"$OUT/provenance.json" <<'END'
+"$PYTHON" - "$PRESET" "$SECONDS" "$OUT/provenance.json" <<'END'
 import json
 import sys
+from pathlib import Path
 
 from lerobot_wm.report.provenance import provenance
 
-command = f"scripts/paper_gpu.sh {sys.argv[1]}"
-print(json.dumps({**provenance(), "command": command, "wall_seconds": int(sys.argv[2])}, indent=2))
+preset, seconds, file = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
+if file.is_file():  # of a call that this one went on from
+    seconds += json.loads(file.read_text())["wall_seconds"]
+record = {**provenance(), "command": f"scripts/paper_gpu.sh {preset}", "wall_seconds": seconds}
+file.write_text(json.dumps(record, indent=2) + "\n")
 END
 printf '%s: %d min %d s (exit code %d)\n' "$OUT" $((SECONDS / 60)) $((SECONDS % 60)) "$status"
 exit "$status"

@@ -103,7 +103,7 @@ for arm in "${ARMS[@]}"; do
   run_stage "Train $arm" "$(checkpoint "$arm")" train_policy "$arm"
 done
 for arm in "${ARMS[@]}"; do
-  run_stage "Roll out $arm" "$OUT/eval_$arm/eval_info.json" evaluate "$arm"
+  run_stage "Roll out $arm" "$OUT/eval_$arm/records.jsonl" evaluate "$arm"
 done
 rm -rf "$OUT/report" # cheap, so it always shows the records that are there
 run_stage "Report" "$OUT/report/index.html" report

@@ -25,6 +25,7 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
+from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.report.provenance import provenance
 
@@ -80,6 +81,12 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     register_third_party_plugins()
+    worlds = {
+        LatentRecord.read(root).world_model_fingerprint
+        for root in (arguments.demonstrations, arguments.others)
+    }
+    if len(worlds) > 1:
+        parser.error("the two latent datasets are of different world models: encode both with the same")
     known, others = read(arguments.demonstrations), read(arguments.others)
     errors = {
         "latents": reading(known.latents, known.way, others.latents) - others.way,  # (M, 3)

@@ -3,8 +3,11 @@ from pathlib import Path
 import pytest
 import torch
 from accelerate import Accelerator
+from accelerate.state import AcceleratorState
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies.act.configuration_act import ACTConfig
 from torch import Tensor, nn
 
 from lerobot_wm.pipeline.accelerator import RamAccelerator, make_accelerator
@@ -50,3 +53,27 @@ def test_a_step_is_the_optimizers_own(accelerator: RamAccelerator, monkeypatch: 
 def test_unwrapping_gives_what_accelerate_gives(accelerator: RamAccelerator) -> None:
     prepared = accelerator.prepare(Line())
     assert accelerator.unwrap_model(prepared) is Accelerator.unwrap_model(accelerator, prepared)
+
+
+@pytest.mark.parametrize(
+    ("policy", "launched_with", "expected"),
+    [
+        (ACTConfig(device="cpu", use_amp=True), None, "bf16"),
+        (ACTConfig(device="cpu"), None, "no"),
+        (ACTConfig(device="cpu"), "bf16", "bf16"),
+        (E2EBCConfig(device="cpu", dtype="float32"), "bf16", "no"),
+    ],
+)
+def test_the_precision_is_lerobots(
+    policy: PreTrainedConfig,
+    launched_with: str | None,
+    expected: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if launched_with is not None:
+        monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", launched_with)
+    AcceleratorState._reset_state(reset_partial_state=True)
+    cfg = TrainPipelineConfig(DatasetConfig("test/demos"), policy=policy, output_dir=tmp_path)
+    assert make_accelerator(cfg).mixed_precision == expected
+    AcceleratorState._reset_state(reset_partial_state=True)

@@ -88,3 +88,13 @@ def test_other_rollouts_than_expected_are_refused(tmp_path: Path, preset: Preset
     with pytest.raises(ValueError, match=r"expected the 6 of \('wm_bc', 0\)"):
         ledger.add("wm_bc", 0, [write(tmp_path / "a.jsonl", records)])
     assert ledger.empty
+
+
+def test_records_of_another_preset_are_refused(tmp_path: Path, preset: Preset) -> None:
+    records = [record | {"preset": "cpu"} for record in rollouts("wm_bc", 0, preset)]
+    file, none = write(tmp_path / "results.jsonl", records), tmp_path / "none.jsonl"
+    for path, committed in ((file, none), (none, file)):
+        with pytest.raises(ValueError, match=r"results\.jsonl: rollouts of the preset cpu, .* for 'smoke'"):
+            Ledger(path, committed, preset)
+    with pytest.raises(ValueError, match="rollouts of the preset cpu"):
+        Ledger(none, none, preset).add("wm_bc", 0, [file])

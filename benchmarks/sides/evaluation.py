@@ -10,6 +10,7 @@ from benchmarks.sides.command import per_minute
 from benchmarks.timing import Prepared
 from lerobot_wm.constants import IMAGE_SIZE
 
+LEROBOT_VIDEOS = 10  # of each task, which lerobot-eval makes without a flag against it
 LEROBOT_IMAGE_SIZE = 480  # its metaworld environment has no other; the policy scales its images down
 
 
@@ -17,7 +18,7 @@ def ours(folder: Path, rollouts_per_task: int, workers: int) -> Prepared:
     """Rollouts per minute of `lerobot-wm eval` on metaworld_mt."""
     command = [
         *("lerobot_wm.cli", "eval", "--env.type=metaworld_mt"),
-        *(f"--num_workers={workers}", "--videos_per_task=0"),
+        *(f"--num_workers={workers}", f"--videos_per_task={min(LEROBOT_VIDEOS, rollouts_per_task)}"),
     ]
     return _prepared(command, IMAGE_SIZE, folder, rollouts_per_task)
 

@@ -1,6 +1,7 @@
 """Camera frames decoded once, at a model's image size, into uint8 and memory-mapped from a file beside the dataset."""
 
 import logging
+import math
 import os
 import shutil
 from collections.abc import Iterable, Iterator
@@ -27,13 +28,15 @@ logger = logging.getLogger(__name__)
 
 CACHE_VARIABLE = "LEROBOT_WM_CACHE"
 
-_FRAMES_PER_CHUNK = 64  # held as float32 at once: bounds memory for long episodes of large images
+# Of frames that each thread holds at once: bounds memory for long episodes of large images.
+_CHUNK_BYTES = 2**25
 
 
 def cache_root(dataset_root: Path) -> Path:
     """Where what is derived from a dataset lives: `<root>.cache` beside it, or under $LEROBOT_WM_CACHE.
 
-    The folder can be deleted at any time; it is made again when needed.
+    Decoded frames are made again when needed. The latents of a training are too when it is started anew, but one that
+    is to be resumed needs them where they are.
 
     Raises:
         PermissionError: The place cannot be written.
@@ -152,22 +155,24 @@ class CameraCache:
         """An episode's frames as they are stored, some at a time: (T, C, H, W) uint8."""
         meta = self._dataset.meta
         start, stop = row["dataset_from_index"], row["dataset_to_index"]
+        count = max(1, _CHUNK_BYTES // math.prod(self._frame_shape()))
         if self._key in meta.video_keys:
-            # LeRobot's own decoder, asked for a whole episode at once: equal frames, one seek.
             first = row[f"videos/{self._key}/from_timestamp"]
-            images = decode_video_frames(
-                self._file(row["episode_index"]),
-                [first + i / meta.fps for i in range(stop - start)],
-                tolerance_s=1 / (4 * meta.fps),
-                return_uint8=True,
-            )
-            yield from images.split(_FRAMES_PER_CHUNK)
+            for position in range(0, stop - start, count):
+                # Not by torchcodec, for which LeRobot keeps one decoder per file, and other threads read the same file.
+                yield decode_video_frames(
+                    self._file(row["episode_index"]),
+                    [first + i / meta.fps for i in range(position, min(position + count, stop - start))],
+                    tolerance_s=1 / (4 * meta.fps),
+                    backend="pyav",
+                    return_uint8=True,
+                )
             return
         relative = self._dataset.absolute_to_relative_idx
         column = self._dataset.hf_dataset.select_columns(self._key)  # other cameras' images stay undecoded
-        for position in range(start, stop, _FRAMES_PER_CHUNK):
+        for position in range(start, stop, count):
             first = position if relative is None else relative[position]
-            rows = column[first : first + min(_FRAMES_PER_CHUNK, stop - position)][self._key]
+            rows = column[first : first + min(count, stop - position)][self._key]
             yield (torch.stack(rows) * 255).round().to(torch.uint8)
 
     def _frame_shape(self) -> tuple[int, int, int]:

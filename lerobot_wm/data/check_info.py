@@ -19,7 +19,7 @@ MEND = "copy or download the dataset again, whole"
 _MAX_NAME = 120  # characters of a feature's name, which becomes part of file names
 _MAX_COUNT = 2**53
 _CAMERA_DTYPES = ("image", "video")
-_TEXT_DTYPES = ("string", "language")
+TEXT_DTYPES = ("string", "language")
 _NUMBER = r"\{(?:chunk|file)_index(?::\d{0,2}d)?\}"
 _DATA_PATTERN = re.compile(rf"data/(?:[\w.-]|{_NUMBER})+/(?:[\w.-]|{_NUMBER})+\.parquet", re.ASCII)
 _VIDEO_PATTERN = re.compile(rf"videos/(?:[\w./-]|{_NUMBER}|\{{video_key\}})+", re.ASCII)
@@ -180,7 +180,7 @@ def _check_feature(path: Path, name: str, feature: Any) -> None:
         )
     dtype, shape, names = feature.get("dtype"), feature.get("shape"), feature.get("names")
     camera = dtype in _CAMERA_DTYPES
-    if not camera and dtype not in _TEXT_DTYPES and not _is_number_type(dtype):
+    if not camera and dtype not in TEXT_DTYPES and not _is_number_type(dtype):
         raise refuse(f"has dtype {shown(dtype)}; expected a type of numbers, image, video or string")
     sizes = shape if isinstance(shape, list) else []
     if not 1 <= len(sizes) <= 5 or not all(type(size) is int and 0 < size < 2**31 for size in sizes):

@@ -1,6 +1,7 @@
 """Content hashes that tie latents to the world model and the dataset they came from."""
 
 import hashlib
+from functools import lru_cache
 from pathlib import Path
 
 from torch import nn
@@ -23,11 +24,18 @@ def dataset_fingerprint(root: Path) -> str:
     Args:
         root: The dataset's folder, as in `LeRobotDataset.root`.
     """
+    paths = [path for folder in ("meta", "data", "videos") for path in sorted((root / folder).rglob("*"))]
+    stats = ((path, path.stat()) for path in paths if path.is_file())
+    return _hash_files(root, tuple((path, stat.st_size, stat.st_mtime_ns) for path, stat in stats))
+
+
+# Each camera and each loader of a run asks, and reading tens of gigabytes takes minutes.
+@lru_cache(maxsize=4)
+def _hash_files(root: Path, files: tuple[tuple[Path, int, int], ...]) -> str:
+    """Hash of the files of a folder: path, size and time of change of each."""
     digest = hashlib.sha256()
-    for folder in ("meta", "data", "videos"):
-        for path in sorted((root / folder).rglob("*")):
-            if path.is_file():
-                digest.update(f"{path.relative_to(root).as_posix()}\n".encode())
-                with path.open("rb") as file:
-                    digest.update(hashlib.file_digest(file, "sha256").digest())
+    for path, _, _ in files:
+        digest.update(f"{path.relative_to(root).as_posix()}\n".encode())
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()[:_HEX_DIGITS]

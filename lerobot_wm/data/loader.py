@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_wm.data.cache import camera_frames
+from lerobot_wm.data.check_info import TEXT_DTYPES
 from lerobot_wm.data.finite import check_finite_columns
 from lerobot_wm.data.tables import column_tensor
 
@@ -30,7 +31,7 @@ class RamDataset:
             as they are.
 
     Raises:
-        ValueError: The dataset applies image transforms, which decoded frames do not go through.
+        ValueError: The dataset applies image transforms, which decoded frames do not go through, or has depth cameras.
         DatasetError: An observation, action or reward is not finite.
     """
 
@@ -47,22 +48,36 @@ class RamDataset:
             )
         self.device = device
         meta = dataset.meta
+        depth = [key for key in meta.depth_keys if cameras is None or key in cameras]
+        if depth:
+            raise ValueError(
+                f"{dataset.repo_id} has depth cameras, {', '.join(depth)}: frames are served as uint8, which cannot "
+                "hold them. Train with lerobot-train, or remove them with lerobot-edit-dataset."
+            )
         self._tasks = [str(task) for task in meta.tasks.index]
         self._deltas: dict[str, list[int]] = dataset.reader.delta_indices or {}
-        features = {key: tuple(feature["shape"]) for key, feature in meta.features.items()}
+        kinds = {key: feature["dtype"] for key, feature in meta.features.items()}
         self._columns = {
-            key: column_tensor(dataset.hf_dataset, key, shape).to(device)
-            for key, shape in features.items()
-            if key not in meta.camera_keys
+            key: column_tensor(dataset.hf_dataset, key, tuple(meta.features[key]["shape"])).to(device)
+            for key, kind in kinds.items()
+            if key not in meta.camera_keys and kind not in TEXT_DTYPES
+        }
+        # LeRobot's collation drops columns of its type "language".
+        self._texts = {
+            key: list(dataset.hf_dataset.with_format(None)[key])
+            for key, kind in kinds.items()
+            if kind == "string"
         }
         check_finite_columns(self._columns, self._tasks, dataset.repo_id)
         # PNG frames leave LeRobot's loader as float32, video frames as uint8 for the training loop to convert.
         self._float_cameras = set(meta.image_keys)
-        self._cameras = {
-            key: self._resident(camera_frames(dataset, key, None if cameras is None else cameras[key]))
-            for key in meta.camera_keys
-            if cameras is None or key in cameras
-        }
+        self._cameras = self._resident(
+            {
+                key: camera_frames(dataset, key, None if cameras is None else cameras[key])
+                for key in meta.camera_keys
+                if cameras is None or key in cameras
+            }
+        )
 
         episode = self._columns["episode_index"]
         starts = torch.searchsorted(episode, episode)  # rows of an episode are consecutive
@@ -87,6 +102,8 @@ class RamDataset:
             out[key] = (
                 self._images(key, window) if key in self._cameras else gather(self._columns[key], window)
             )
+        for key, texts in self._texts.items():
+            out[key] = [texts[row] for row in rows]
         out["task"] = [self._tasks[i] for i in out["task_index"].tolist()]
         return out
 
@@ -103,11 +120,13 @@ class RamDataset:
         images = images.movedim(-1, -3)
         return images.float() / 255 if key in self._float_cameras else images
 
-    def _resident(self, frames: Tensor) -> Tensor:
+    def _resident(self, cameras: dict[str, Tensor]) -> dict[str, Tensor]:
         if self.device.type != "cuda":
-            return frames
+            return cameras
         free, _ = torch.cuda.mem_get_info(self.device)
-        return frames.to(self.device) if frames.numel() < _GPU_SHARE * free else frames
+        if sum(frames.numel() for frames in cameras.values()) >= _GPU_SHARE * free:
+            return cameras
+        return {key: frames.to(self.device) for key, frames in cameras.items()}
 
 
 class RamLoader:

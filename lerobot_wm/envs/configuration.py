@@ -73,6 +73,11 @@ class MetaworldMTEnvConfig(EnvConfig):
             raise ValueError(f"image_size is {self.image_size}; expected at least 16 pixels.")
         if not 1 <= self.episode_length <= MAX_EPISODE_STEPS:
             raise ValueError(f"episode_length is {self.episode_length}; expected 1 to {MAX_EPISODE_STEPS}.")
+        if self.max_parallel_tasks > 1:
+            raise ValueError(
+                f"max_parallel_tasks is {self.max_parallel_tasks}: LeRobot would have one policy act in several tasks "
+                "by turns, which mixes up what it remembers of them. Use 1, or lerobot-wm eval --num_workers."
+            )
         shape = (self.image_size, self.image_size, 3)
         keys = image_features(parse_cameras(self.camera_name))
         for camera, key in keys.items():

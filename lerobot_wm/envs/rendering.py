@@ -2,8 +2,8 @@
 
 Shadow maps, multisampling and reflections take nine tenths of Meta-World's drawing time at small sizes and
 carry no information a policy needs: they are off by default. All OpenGL calls of a process are made by one
-thread with one context. A context is bound to its thread while LeRobot may evaluate tasks in several
-(`--env.max_parallel_tasks`), and two contexts in one thread draw into each other's images unless switched.
+thread with one context: a context is bound to the thread that made it, while environments may be used from any, and
+two contexts in one thread draw into each other's images unless switched.
 """
 
 import atexit

@@ -19,17 +19,18 @@ class Ledger:
         preset: Says which rollouts an arm and seed has.
 
     Raises:
-        ValueError: a file holds something else than records.
+        ValueError: a file holds something else than records, or those of another preset.
     """
 
     def __init__(self, path: Path, committed: Path, preset: Preset) -> None:
         self.path = path
+        self._preset = preset.name
         self._rollouts = {(task, k) for task in preset.task_names for k in preset.variations}
         self._runs: dict[tuple[str, int | None], list[Record]] = {}
         for file in (path, committed):
             if file.is_file() and file.stat().st_size:
                 self._runs |= {
-                    run: rows for run, rows in by_run(read_records([file])).items() if self._whole(rows)
+                    run: rows for run, rows in by_run(self._read([file])).items() if self._whole(rows)
                 }
 
     def __contains__(self, run: tuple[str, int]) -> bool:
@@ -45,11 +46,11 @@ class Ledger:
         """Take the rollouts of a finished arm and seed; those it has already are left as they are.
 
         Raises:
-            ValueError: the files hold other rollouts than these.
+            ValueError: the files hold other rollouts than these, or those of another preset.
         """
         if (arm, seed) in self:
             return
-        records = read_records(files)
+        records = self._read(files)
         if set(by_run(records)) != {(arm, seed)} or not self._whole(records):
             found = sorted({(record["arm"], record["seed"]) for record in records}, key=str)
             raise ValueError(
@@ -65,6 +66,16 @@ class Ledger:
         unfinished = self.path.with_name(f"{self.path.name}.part")
         unfinished.write_text("".join(record_line(record) for rows in self._runs.values() for record in rows))
         os.replace(unfinished, self.path)
+
+    def _read(self, files: list[Path]) -> list[Record]:
+        records = read_records(files)
+        others = {record["preset"] for record in records} - {self._preset}
+        if others:
+            raise ValueError(
+                f"{', '.join(map(str, files))}: rollouts of the preset {', '.join(sorted(map(str, others)))}, which do "
+                f"not count for '{self._preset}'. Give another --output_dir or --results_dir."
+            )
+        return records
 
     def _whole(self, records: list[Record]) -> bool:
         return {(record["task"], record["variation"]) for record in records} == self._rollouts

@@ -168,7 +168,7 @@ class Plan:
             kind="evaluate_task" if task else "evaluate",
             argv=lerobot_wm("eval", flags, *arm.eval_flags),
             folder=folder,
-            artefact=folder / "eval_info.json",
+            artefact=folder / "records.jsonl",
             needs=(policy.made_by,),
             takes_workers=True,
         )

@@ -25,6 +25,7 @@ class Running:
 
     def __init__(self, stage: Stage, cores: int, lock: IO) -> None:
         self.stage = stage
+        self.resumed = stage.resumes  # from a checkpoint: its time is that of a part
         self._started = time.monotonic()
         command = stage.command(cores)
         stage.prepare()

@@ -14,6 +14,7 @@ from lerobot_wm.experiment.experiment import Experiment
 from lerobot_wm.experiment.lock import exclusive
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import load_preset, select_runs
+from lerobot_wm.experiment.settings import check_settings
 from lerobot_wm.experiment.stage import Stage
 
 LOG_TAIL = 15  # lines of a failed stage's log that are shown
@@ -76,6 +77,7 @@ def main() -> None:
             return
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
         with exclusive(output_dir) as lock:
+            check_settings(preset, output_dir)
             experiment = Experiment(plan, runs, results_dir, args.processes, args.quality)
             failed = experiment.run(lock, console)
             reported = experiment.report()

@@ -85,7 +85,8 @@ class Runner:
                 continue
             self._running.remove(work)
             if work.returncode == 0 and work.stage.finished:
-                self._times.note(work.stage, work.seconds)
+                if not work.resumed:
+                    self._times.note(work.stage, work.seconds)
                 self._progress.finished(work.stage, work.seconds)
                 self._on_finish(work.stage)
             else:

@@ -22,7 +22,7 @@ class Times:
         self._measured: dict[str, dict] = json.loads(path.read_text()) if path.is_file() else {}
 
     def note(self, stage: Stage, seconds: float) -> None:
-        """Add a finished stage."""
+        """Add a finished stage, measured from its start: not one that went on from a checkpoint."""
         self._measured[stage.name] = {"kind": stage.kind, "seconds": round(seconds, 1)}
         self._path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = self._path.with_name(f"{self._path.name}.part")

@@ -1,5 +1,6 @@
 """The command that trains a policy as a run did, read from the run's configuration."""
 
+import json
 import shlex
 from dataclasses import fields
 from pathlib import Path
@@ -46,6 +47,16 @@ def train_command(cfg: TrainPipelineConfig, latents: LatentRecord | None) -> str
         if cfg.policy.pretrained_revision is not None:
             flags["policy.pretrained_revision"] = cfg.policy.pretrained_revision
     flags |= _policy_flags(cfg.policy)
+    cameras = getattr(cfg.policy, "image_key", None)
+    # Those of a policy on latents are its world model's; all that there are need not be named.
+    if (
+        cameras
+        and not hasattr(cfg.policy, "world_model_path")
+        and cameras != ",".join(cfg.policy.image_features)
+    ):
+        flags["policy.image_key"] = cameras
+    if cfg.rename_map:
+        flags["rename_map"] = json.dumps(cfg.rename_map)
     flags["dataset.repo_id"] = cfg.dataset.repo_id if latents is None else latents.source_repo_id
     if cfg.dataset.revision is not None and latents is None:
         flags["dataset.revision"] = cfg.dataset.revision

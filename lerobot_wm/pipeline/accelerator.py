@@ -7,6 +7,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs, InitProcessGroupKwargs
 from accelerate.data_loader import BatchSamplerShard
 from accelerate.utils import DistributedType
@@ -122,12 +123,13 @@ def make_accelerator(cfg: TrainPipelineConfig) -> RamAccelerator:
         RuntimeError: Several processes were asked for, and accelerate started one.
     """
     policy = cfg.policy
-    # As in LeRobot: a policy's own `dtype` decides the precision, `use_amp` where it has none.
-    dtype = getattr(policy, "dtype", "bfloat16" if policy.use_amp else "float32")
+    # As in LeRobot: a policy's own `dtype` decides the precision; where it has none `use_amp`, or the launcher.
+    amp_dtype = torch.get_autocast_dtype(torch.device(policy.device).type) if policy.use_amp else None
+    dtype = str(getattr(policy, "dtype", amp_dtype)).removeprefix("torch.")
     accelerator = RamAccelerator(
         cfg,
         step_scheduler_with_optimizer=False,
-        mixed_precision={"bfloat16": "bf16", "float16": "fp16"}.get(dtype, "no"),
+        mixed_precision={"bfloat16": "bf16", "float16": "fp16", "float32": "no"}.get(dtype),
         kwargs_handlers=[
             DistributedDataParallelKwargs(find_unused_parameters=True),
             InitProcessGroupKwargs(timeout=_PATIENCE),

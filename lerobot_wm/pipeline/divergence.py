@@ -64,7 +64,7 @@ class LossWatch:
         )
         raise DivergenceError(
             f"training diverged: {parts} is NaN or Inf on a batch of the episodes {episodes}. It did "
-            f"not reach the weights; {saved}. Train with a lower --policy.lr, or in --policy.dtype=float32."
+            f"not reach the weights; {saved}. Train again with a lower --policy.lr, or go on in --policy.dtype=float32."
         )
 
     def _broken_parts(self) -> Iterator[str]:

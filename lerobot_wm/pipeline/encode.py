@@ -35,6 +35,8 @@ from lerobot_wm.policies.frozen_encoder import EncoderPolicy, load_encoder
 
 logger = logging.getLogger(__name__)
 
+LATENTS_PREFIX = "latents-"  # of the folders in a dataset's cache
+
 
 def encode(
     policy: EncoderPolicy,
@@ -160,14 +162,15 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
     """
     policy = load_encoder(world_model_path).to(device)
     root = Path(meta.root)
-    name = f"latents-{weights_fingerprint(policy.world_model)}-{dataset_fingerprint(root)}"
+    # Opened before it is hashed: of a dataset of the Hub only the metadata may be here yet.
+    source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
+    name = f"{LATENTS_PREFIX}{weights_fingerprint(policy.world_model)}-{dataset_fingerprint(root)}"
     output_root = cache_root(root) / name
     with sole_writer(output_root, wait=True):  # another training may be encoding it
         if output_root.is_dir():
             logger.info("Latents found in %s", output_root)
         else:
             logger.info("Encoding %s into %s", repo_id, output_root)
-            source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
             encode(policy, source, f"{repo_id}_latents", output_root)
     return output_root
 

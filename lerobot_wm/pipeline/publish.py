@@ -26,7 +26,7 @@ from lerobot_wm.report.records import Record, find_records, read_records
 from lerobot_wm.report.tables import ReportTable, markdown_table, table_by_split
 
 UPLOADED = ("*.safetensors", "*.json", "*.yaml")  # of a checkpoint's folder, as LeRobot uploads them
-SEEN = "Seen variations are those that demonstrations were collected on."
+SEEN = "Seen variations are those that demonstrations are collected on by default, 0-9 of set 42."
 
 
 @dataclass

@@ -16,7 +16,7 @@ from lerobot_wm.data.check import check_dataset, damage_named
 from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.hub.errors import check_can_push, check_dataset_version
 from lerobot_wm.pipeline.accelerator import RamAccelerator, make_accelerator
-from lerobot_wm.pipeline.encode import encode_to_cache
+from lerobot_wm.pipeline.encode import LATENTS_PREFIX, encode_to_cache
 from lerobot_wm.pipeline.processors import check_policy_path, check_processors
 from lerobot_wm.pipeline.train_resume import clear_unfinished, how_to_go_on, restore_last, stops_explained
 from lerobot_wm.pipeline.training_run import check_run_settings, check_training_state
@@ -74,6 +74,22 @@ def encode_if_needed(cfg: TrainPipelineConfig) -> None:
         cfg.dataset.revision = None
 
 
+def check_latents_are_there(cfg: TrainPipelineConfig) -> None:
+    """Refuse to go on with a training whose encoded dataset was removed from the cache.
+
+    Raises:
+        FileNotFoundError: It is gone; names the command that makes it again.
+    """
+    root = Path(cfg.dataset.root or ".")
+    if root.exists() or not root.name.startswith(LATENTS_PREFIX):
+        return
+    raise FileNotFoundError(
+        f"{root} is gone, the latents that this training reads. To go on, make them again: lerobot-wm encode "
+        f"--world_model_path={cfg.checkpoint_path / 'pretrained_model'} --dataset.repo_id=... --dataset.root=... "
+        f"--output_repo_id={cfg.dataset.repo_id} --output_root={root}, with the dataset of images as --dataset."
+    )
+
+
 @parser.wrap()
 def train(cfg: TrainPipelineConfig) -> None:
     """Train any LeRobot policy as `lerobot-train` does, from the same flags, into the same checkpoints."""
@@ -105,6 +121,8 @@ def train(cfg: TrainPipelineConfig) -> None:
 
 
 def _train(cfg: TrainPipelineConfig, accelerator: RamAccelerator) -> None:
+    if cfg.resume:
+        check_latents_are_there(cfg)
     if cfg.resume and accelerator.is_main_process:
         clear_unfinished(cfg.checkpoint_path, cfg.output_dir)
     check_dataset(cfg.dataset.repo_id, cfg.dataset.root)
@@ -120,11 +138,22 @@ def _train(cfg: TrainPipelineConfig, accelerator: RamAccelerator) -> None:
         logging.getLogger().removeFilter(log)
 
 
+def _check_resumes_into_a_folder(config_path: str) -> None:
+    # LeRobot names a folder by the time at each of several looks, and would leave the run's files in two.
+    resume = (parser.parse_arg("resume") or "false").lower() in ("true", "yes", "on", "1")
+    if resume and not Path(config_path).exists() and parser.parse_arg("output_dir") is None:
+        raise ValueError(
+            f"--config_path={config_path} is no file or folder here: to go on with a training of the Hub, name a "
+            "folder for it by --output_dir."
+        )
+
+
 def main() -> None:
     """Entry point of `lerobot-wm train`."""
     config_path = parser.parse_arg("config_path")
     if config_path is not None:
         restore_last(config_path)
         check_run_settings(config_path)
+        _check_resumes_into_a_folder(config_path)
     check_policy_path()
     train()

@@ -20,6 +20,16 @@ def default_dtype(device: str) -> str:
     return "bfloat16" if device == "cpu" and torch.cpu._is_avx512_bf16_supported() else "float32"
 
 
+def check_dtype(dtype: str) -> None:
+    """Refuse autocast types that training does not know; LeRobot and accelerate take unknown ones for float32.
+
+    Raises:
+        ValueError: It is neither of the two.
+    """
+    if dtype not in ("bfloat16", "float32"):
+        raise ValueError(f"dtype is '{dtype}'; expected 'bfloat16' or 'float32'.")
+
+
 def feature_dim(features: dict[str, PolicyFeature], key: str, where: str) -> int:
     """Size of the vector feature `key`.
 

@@ -9,6 +9,8 @@ from lerobot_wm.report.arms import COMPARED_ARMS, by_arm
 from lerobot_wm.report.bootstrap import RNG_SEED, percentile_interval, resample
 from lerobot_wm.report.records import Record
 
+SIGNIFICANCE = 0.05  # McNemar's test below which arms are called different, where it can be made
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -29,13 +31,14 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """The interval in words."""
+        """The comparison in words.
+
+        The bootstrap is too sure of itself where few pairs differ: four won and none lost exclude zero at p 0.125.
+        """
         low, high = self.interval
-        if low > 0:
-            return "better (interval excludes zero)"
-        if high < 0:
-            return "worse (interval excludes zero)"
-        return "no difference shown"
+        if low <= 0 <= high or (self.p_value is not None and self.p_value >= SIGNIFICANCE):
+            return "no difference shown"
+        return f"{'better' if low > 0 else 'worse'} (interval excludes zero)"
 
 
 def compare(records: list[Record], others: list[Record]) -> Comparison | None:

@@ -58,6 +58,13 @@ def load_world_model(path: str) -> WMRSSMPolicy | LatentPolicy:
     return policy.eval()
 
 
+def keys_read(policy: WMRSSMPolicy | LatentPolicy) -> list[str]:
+    """What the world model of a checkpoint reads of an episode."""
+    assert isinstance(policy.world_model, WorldModel)  # as load_world_model checked
+    proprio = [OBS_STATE] if policy.world_model.config.use_proprio else []
+    return [*policy.config.cameras, ACTION, *proprio]
+
+
 def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | None) -> list[OpenLoop]:
     """Predict the last episodes of each task (those LeRobot's `eval_split` holds out).
 
@@ -70,8 +77,7 @@ def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | Non
         raise ValueError(f"{repo_id} has no episode of {WINDOW} frames, which open-loop prediction needs.")
     first_frame = meta.episodes["dataset_from_index"][:]
     times = [step / meta.fps for step in range(WINDOW)]
-    keys = (*policy.config.cameras, ACTION, OBS_STATE)
-    dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(keys, times))
+    dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(keys_read(policy), times))
     return [
         predict(policy, task, [dataset[first_frame[i]] for i in episodes[-EPISODES_PER_TASK:]])
         for task, episodes in tqdm(by_task.items(), desc="Imagining", unit="task")
@@ -86,13 +92,12 @@ def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[s
         policy: holds the world model.
         task: what the windows show.
         windows: each the first WINDOW frames of an episode: every camera (T, C, H, W) in [0, 1], `action` (T, A),
-            `observation.state` (T, P).
+            `observation.state` (T, P) where the world model reads it.
     """
     config, world_model = policy.config, policy.world_model
     assert isinstance(world_model, WorldModel)  # as load_world_model checked
     batch = {
-        key: torch.stack([window[key] for window in windows]).to(config.device)
-        for key in (*config.cameras, ACTION, OBS_STATE)
+        key: torch.stack([window[key] for window in windows]).to(config.device) for key in keys_read(policy)
     }
     images, actions = camera_images(config, batch), batch[ACTION]  # (B, T, C, 64, 64), (B, T, A)
     proprio = batch[OBS_STATE][:, :CONTEXT] if world_model.config.use_proprio else None

@@ -125,10 +125,12 @@ class IQLAgent(nn.Module):
             The sum of the losses and its parts by name, each a detached scalar; those of further actors are
             `actor_loss_beta<β>`.
         """
+        # Before the pass without gradient: autocast of PyTorch before 2.11 keeps the weights it casts there, without
+        # their gradient, for this one.
+        v = self.value(observation).squeeze(-1)  # (B,)
         with torch.no_grad():
             target_q = self.target_critic(observation, action).amin(0)  # (B,)
             next_v = self.value(next_observation).squeeze(-1)  # (B,)
-        v = self.value(observation).squeeze(-1)  # (B,)
         qs = self.critic(observation, action)  # (2, B)
         target = iql.critic_target(reward, next_v, terminal, self.discount)  # (B,)
         advantage = target_q - v  # (B,)

@@ -153,6 +153,8 @@ class WorldModel(LatentModel):
         states, posterior = self._observe(embeds, self._shift(actions), sample=True)
         prior = self.rssm.prior(states.deter)
         latents = states.latent  # (B, T, D+S)
+        # Before the action head observes again: compiled for a GPU, that may write where the posterior lies.
+        kl = posterior.kl(prior)  # (B, T)
 
         errors = {"image_loss": self._image_loss(latents, images)}
         if self.config.use_proprio:
@@ -165,7 +167,7 @@ class WorldModel(LatentModel):
             # s_t predicts r_{t-1}: the first frame of a window has no reward to predict.
             reward_error = (self.predict_reward(latents[:, 1:]) - rewards[:, :-1].float()).square()
             errors["reward_loss"] = nn.functional.pad(reward_error, (1, 0))
-        return world_model_loss(errors, posterior.kl(prior), valid, self.config)
+        return world_model_loss(errors, kl, valid, self.config)
 
     def _decode(self, latents: Tensor) -> Tensor:
         """Images (..., C, 64, 64) in float32, not clipped, from latents (..., D+S)."""

@@ -1,13 +1,16 @@
 """The RAM path serves what LeRobot's own DataLoader serves."""
 
 import shutil
+from hashlib import file_digest
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import decode_video_frames
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_wm.data.cache import CACHE_VARIABLE, camera_frames
@@ -91,6 +94,51 @@ def test_png_dataset_of_two_cameras_equals_lerobots(tmp_path: Path) -> None:
     assert_equal_batches(dataset, list(range(10)))
 
 
+def test_columns_of_text_equal_lerobots(tmp_path: Path) -> None:
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (3,), "names": None},
+        "remark": {"dtype": "string", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("test/text", 10, features, root=tmp_path / "text")
+    for episode, length in enumerate((4, 6)):
+        for t in range(length):
+            state = np.full(3, t, dtype=np.float32)
+            dataset.add_frame({"observation.state": state, "remark": f"{episode}.{t}", "task": "look"})
+        dataset.save_episode()
+    dataset.finalize()
+    rows = [9, 0, 4, 3, 8, 1]
+    for chosen, expected in (
+        (None, ["1.5", "0.0", "1.0", "0.3", "1.4", "0.1"]),
+        ([1], ["1.5", "1.0", "1.4"]),
+    ):
+        dataset = LeRobotDataset("test/text", root=tmp_path / "text", episodes=chosen)
+        wanted = rows if chosen is None else [5, 0, 4]
+        loader = DataLoader(dataset, batch_size=len(wanted), sampler=wanted)
+        [theirs], [ours] = list(loader), list(RamLoader(loader, loader.batch_sampler, CPU))
+        assert theirs.keys() == ours.keys()
+        assert theirs["remark"] == ours["remark"] == expected
+
+
+def test_depth_cameras_are_refused(tmp_path: Path) -> None:
+    camera = {
+        "dtype": "image",
+        "shape": (8, 8, 1),
+        "names": ["height", "width", "channels"],
+        "info": {"is_depth_map": True, "depth_unit": "mm"},
+    }
+    action = {"dtype": "float32", "shape": (1,), "names": None}
+    dataset = LeRobotDataset.create(
+        "test/depth", 10, {"observation.images.depth": camera, "action": action}, root=tmp_path / "depth"
+    )
+    depth = np.zeros((8, 8, 1), dtype=np.uint16)
+    dataset.add_frame({"observation.images.depth": depth, "action": np.zeros(1, np.float32), "task": "look"})
+    dataset.save_episode()
+    dataset.finalize()
+    dataset = LeRobotDataset("test/depth", root=tmp_path / "depth")
+    with pytest.raises(ValueError, match=r"depth cameras, observation\.images\.depth: .*lerobot-train"):
+        RamDataset(dataset, CPU)
+
+
 def test_a_window_never_crosses_an_episode(demos_root: Path) -> None:
     length = 25
     dataset = LeRobotDataset("test/demos", root=demos_root, delta_timestamps=windows(length))
@@ -158,3 +206,43 @@ def test_image_transforms_are_refused(demos_root: Path) -> None:
     dataset = LeRobotDataset("test/demos", root=demos_root, image_transforms=torch.nn.Identity())
     with pytest.raises(ValueError, match="image_transforms"):
         RamDataset(dataset, CPU)
+
+
+def test_frames_are_decoded_some_at_a_time_and_by_no_shared_decoder(
+    demos_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = LeRobotDataset("test/demos", root=demos_root)
+    whole = camera_frames(dataset, "observation.image").clone()
+    asked: list[int] = []
+
+    def counted(path: Path, timestamps: list[float], *args: Any, **kwargs: Any) -> torch.Tensor:
+        asked.append(len(timestamps))
+        return decode_video_frames(path, timestamps, *args, **kwargs)
+
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setattr("lerobot_wm.data.cache.decode_video_frames", counted)
+    monkeypatch.setattr("lerobot_wm.data.cache._CHUNK_BYTES", 30 * 64 * 64 * 3)
+    # As where torchcodec is installed, for which LeRobot keeps one decoder for all threads.
+    monkeypatch.setattr("lerobot.datasets.video_utils.get_safe_default_video_backend", lambda: "torchcodec")
+    assert torch.equal(camera_frames(dataset, "observation.image"), whole)
+    assert max(asked) == 30
+
+
+def test_a_dataset_is_hashed_again_only_when_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashed: list[str] = []
+
+    def counted(file: Any, name: str) -> Any:
+        hashed.append(Path(file.name).name)
+        return file_digest(file, name)
+
+    monkeypatch.setattr("hashlib.file_digest", counted)
+    (tmp_path / "data").mkdir()
+    file = tmp_path / "data" / "table"
+    file.write_text("a")
+    first = dataset_fingerprint(tmp_path)
+    assert dataset_fingerprint(tmp_path) == first
+    assert hashed == ["table"]
+    file.write_text("ab")
+    assert dataset_fingerprint(tmp_path) != first

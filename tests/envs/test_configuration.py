@@ -19,6 +19,11 @@ def test_policy_features() -> None:
     }
 
 
+def test_tasks_at_once_are_refused() -> None:
+    with pytest.raises(ValueError, match="lerobot-wm eval --num_workers"):
+        MetaworldMTEnvConfig(max_parallel_tasks=2)
+
+
 def test_environment_state_reaches_policies_under_lerobots_name() -> None:
     config = MetaworldMTEnvConfig(task="reach-v3", variation_set=43, environment_state=True)
     feature = env_to_policy_features(config)[OBS_ENV_STATE]

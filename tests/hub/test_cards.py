@@ -1,5 +1,7 @@
 """Cards hold what they are given, whatever it is named."""
 
+import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -105,6 +107,21 @@ def test_the_command_trains_the_same_and_tells_no_place(tmp_path: Path) -> None:
     assert train_command(run, None).startswith("lerobot-wm train --policy.path=CHECKPOINT ")
     run.resume = True
     assert train_command(run, None).startswith("lerobot-wm train --policy.type=wm_bc ")
+
+
+def test_the_command_chooses_the_same_cameras(tmp_path: Path) -> None:
+    front, wrist = "observation.images.front", "observation.images.wrist"
+    policy = WMRSSMConfig(device="cpu", image_key=f"{front},{wrist}")
+    policy.input_features = features("VISUAL", front, (3, 8, 8)) | features("VISUAL", wrist, (3, 8, 8))
+    run = TrainPipelineConfig(dataset=DatasetConfig(repo_id="user/x"), policy=policy, output_dir=tmp_path)
+    assert "image_key" not in train_command(run, None)
+    assert "rename_map" not in train_command(run, None)
+    for chosen in (wrist, f"{wrist},{front}"):
+        policy.image_key = chosen
+        assert f" --policy.image_key={chosen} " in train_command(run, None)
+    run.rename_map = {"observation.images.top": front}
+    [flag] = [word for word in shlex.split(train_command(run, None)) if "rename_map" in word]
+    assert json.loads(flag.removeprefix("--rename_map=")) == run.rename_map
 
 
 REACH, DOOR = "Reach a goal position", "Open a door with a revolving joint"

@@ -1,18 +1,23 @@
+import re
 import shutil
 import sys
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.pipeline.encode import encode_to_cache
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
@@ -347,3 +352,54 @@ def test_cameras_that_a_policy_does_not_read_are_not_decoded(
         f"{DATASET_FLAGS.format(root=demos)} --output_dir={tmp_path / 'run'}",
     )
     assert not list(tmp_path.rglob("*.npy"))
+
+
+def test_a_dataset_that_is_still_to_be_downloaded_is_encoded_once(
+    demos_root: Path, world_model_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "demos"
+    shutil.copytree(demos_root / "meta", root / "meta")  # all that LeRobotDatasetMetadata downloads
+
+    def download(*args: Any, **kwargs: Any) -> LeRobotDataset:
+        for folder in ("data", "videos"):
+            shutil.copytree(demos_root / folder, root / folder, dirs_exist_ok=True)
+        return LeRobotDataset(*args, **kwargs)
+
+    monkeypatch.setattr("lerobot_wm.pipeline.encode.LeRobotDataset", download)
+    meta = LeRobotDatasetMetadata("test/demos", root=root)
+    first = encode_to_cache(str(world_model_path), "test/demos", meta, "cpu")
+    assert encode_to_cache(str(world_model_path), "test/demos", meta, "cpu") == first
+
+
+def test_a_training_whose_latents_were_removed_says_how_to_make_them_again(
+    demos_root: Path,
+    world_model_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    lerobot_wm_command: Callable[..., None],
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    run = tmp_path / "run"
+    lerobot_wm_command(
+        f"train --policy.type=wm_bc --policy.world_model_path={world_model_path} --steps=2 --save_freq=1",
+        f"--batch_size=4 {TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)} --output_dir={run}",
+    )
+    [latents] = (tmp_path / "cache").glob("*/latents-*")
+    shutil.rmtree(latents)
+    checkpoint = run / "checkpoints" / "000001" / "pretrained_model"
+    shutil.rmtree(run / "checkpoints" / "000002")
+    go_on = f"train --config_path={checkpoint / 'train_config.json'} --resume=true"
+    with pytest.raises(FileNotFoundError, match="lerobot-wm encode") as error:
+        lerobot_wm_command(go_on)
+    flags = re.search(r"lerobot-wm (encode .*?), with", str(error.value))[1]
+    flags = flags.replace("repo_id=...", "repo_id=test/demos").replace("root=...", f"root={demos_root}")
+    lerobot_wm_command(f"{flags} --device=cpu")
+    lerobot_wm_command(go_on)
+    assert (run / "checkpoints" / "000002").is_dir()
+
+
+def test_to_go_on_with_a_training_of_the_hub_needs_a_folder(
+    tmp_path: Path, policy_paths: dict[str, Path], lerobot_wm_command: Callable[..., None]
+) -> None:
+    with pytest.raises(ValueError, match=r"someone/wm_bc is no file or folder here.*--output_dir"):
+        lerobot_wm_command("train --config_path=someone/wm_bc --resume=true")

@@ -130,6 +130,13 @@ def test_the_factory_finds_policy_and_configuration(policy_type: str) -> None:
     assert isinstance(config, annotation)
 
 
+@pytest.mark.parametrize("policy_type", TRAINED)
+@pytest.mark.parametrize("dtype", ["bf16", "float16"])
+def test_an_unknown_precision_is_refused(policy_type: str, dtype: str) -> None:
+    with pytest.raises(ValueError, match=f"'{dtype}'; expected 'bfloat16' or 'float32'"):
+        make_policy_config(policy_type, dtype=dtype)
+
+
 @pytest.mark.parametrize("policy_type", TYPES)
 def test_defaults_make_a_policy_from_features_alone(policy_type: str, make: Make) -> None:
     """Without a dataset, as when a policy is made for an environment."""

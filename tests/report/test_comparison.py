@@ -31,6 +31,15 @@ def test_known_difference_and_mcnemar(make_records: Callable) -> None:
     assert reverse.verdict == "worse (interval excludes zero)"
 
 
+def test_what_mcnemars_test_does_not_tell_apart_is_not_called_better(make_records: Callable) -> None:
+    found = compare(
+        make_records("wm_bc", {"reach-v3": (10, 34)}), make_records("wm_iql", {"reach-v3": (10, 30)})
+    )
+    assert (found.only_arm, found.only_other, found.p_value) == (4, 0, 0.125)
+    assert found.interval[0] > 0
+    assert found.verdict == "no difference shown"
+
+
 def test_equal_arms(make_records: Callable) -> None:
     found = compare(make_records("wm_bc", TASKS), make_records("wm_iql", TASKS))
     assert (found.difference, found.interval, found.p_value) == (0, (0, 0), 1)

@@ -1,5 +1,6 @@
 """Open-loop prediction with a real (untrained) world model on real frames."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model, open_loop, strips_figure
+from tests.flags import SMALL_WORLD_MODEL
 
 
 @torch.no_grad()
@@ -52,6 +54,27 @@ def test_strips_show_truth_above_imagination(world_model_path: Path, episodes_ro
     np.testing.assert_array_equal(shown, results[1].truth[CONTEXT - 1 + HORIZONS[2]].transpose(1, 2, 0))
     shown = axes[3, 3].images[0].get_array()
     np.testing.assert_array_equal(shown, results[1].imagined[HORIZONS[2] - 1].transpose(1, 2, 0))
+
+
+def test_data_without_proprioception(tmp_path: Path, lerobot_wm_command: Callable[..., None]) -> None:
+    features = {
+        OBS_IMAGE: {"dtype": "image", "shape": (64, 64, 3), "names": ["height", "width", "channels"]},
+        ACTION: {"dtype": "float32", "shape": (2,), "names": None},
+    }
+    root, images = tmp_path / "data", np.random.default_rng(0)
+    dataset = LeRobotDataset.create("test/images", 10, features, root=root, use_videos=False)
+    for _ in range(WINDOW):
+        image = images.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+        dataset.add_frame({OBS_IMAGE: image, ACTION: np.zeros(2, np.float32), "task": "look"})
+    dataset.save_episode()
+    dataset.finalize()
+    lerobot_wm_command(
+        f"init --policy.type=wm_rssm {SMALL_WORLD_MODEL} --dataset.repo_id=test/images --dataset.root={root}",
+        f"--output_dir={tmp_path / 'init'}",
+    )
+    policy = load_world_model(str(tmp_path / "init" / "pretrained_model"))
+    [result] = open_loop(policy, "test/images", str(root))
+    assert (result.task, result.n_episodes) == ("look", 1)
 
 
 def test_a_policy_that_is_blind_is_refused(world_model_path: Path, tmp_path: Path) -> None:

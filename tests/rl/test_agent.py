@@ -147,3 +147,15 @@ def test_every_trained_parameter_is_in_one_group_and_the_actors_come_first() -> 
     trained = [id(p) for p in agent.parameters() if p.requires_grad]
     assert sorted(trained) == sorted(id(p) for group in agent.param_groups() for p in group["params"])
     assert not set(map(id, agent.target_critic.parameters())) & set.union(*groups)
+
+
+def test_every_trained_parameter_gets_a_gradient_in_bfloat16() -> None:
+    # PyTorch before 2.11 lost that of weights which a pass without gradient had read first.
+    agent = make_agent([0.5, 3.0])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss, _ = agent.loss(**transitions(0))
+    loss.backward()
+    without = [
+        name for name, weight in agent.named_parameters() if weight.requires_grad and weight.grad is None
+    ]
+    assert without == []

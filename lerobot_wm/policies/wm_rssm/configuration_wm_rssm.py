@@ -8,7 +8,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.compile import CompileConfig
-from lerobot_wm.policies.features import default_dtype, feature_dim
+from lerobot_wm.policies.features import check_dtype, default_dtype, feature_dim
 from lerobot_wm.policies.lr_decay import LRDecayConfig
 from lerobot_wm.policies.optim import FusedAdamConfig
 from lerobot_wm.policies.rewards import RewardConfig
@@ -47,6 +47,7 @@ class WMRSSMConfig(LRDecayConfig, CompileConfig, WorldModelConfig, RewardConfig)
             raise ValueError(f"window_length is {self.window_length}; a window needs at least 2 steps.")
         if self.dtype is None:
             self.dtype = default_dtype(str(self.device))
+        check_dtype(self.dtype)
         self.drop_n_last_frames = self.window_length - 1  # no setting: read by LeRobot's sampler
 
     def fit_windows(self, shortest_episode: int) -> None:

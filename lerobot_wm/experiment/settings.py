@@ -1,0 +1,40 @@
+"""The settings an output folder was made with, so that changed ones are not mixed into it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from lerobot_wm.experiment.preset import PRESET_FILE, Preset
+
+SETTINGS_NAME = "settings.json"
+
+_CHANGE_NOTHING_MADE = ("arms", "minutes", "videos_per_task")  # of experiment.json
+
+
+def check_settings(preset: Preset, output_dir: Path) -> None:
+    """Note a preset's settings in the folder it writes to; refuse one that was made with others.
+
+    What is finished there is not made again: with changed settings, tables would join results of both.
+
+    Args:
+        preset: Its settings files are read.
+        output_dir: Where everything is written; made if it is not there.
+
+    Raises:
+        ValueError: Names the file, what has changed, and how to go on.
+    """
+    path = output_dir / SETTINGS_NAME
+    known: dict[str, dict[str, Any]] = json.loads(path.read_text()) if path.is_file() else {}
+    now = {file.name: json.loads(file.read_text()) for file in sorted(preset.folder.glob("*.json"))}
+    for name in _CHANGE_NOTHING_MADE:
+        now[PRESET_FILE].pop(name)
+    for file, settings in now.items():
+        before = known.get(file, settings)
+        changed = [key for key in {**before, **settings} if before.get(key) != settings.get(key)]
+        if changed:
+            raise ValueError(
+                f"{output_dir} was made with other settings: {', '.join(changed)} of {preset.folder / file}. Set them "
+                f"back or give another --output_dir; or remove there what depends on them, and {path}."
+            )
+    output_dir.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(known | now, indent=1) + "\n")
