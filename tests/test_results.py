@@ -39,6 +39,25 @@ def test_readme_shows_the_committed_rollouts(preset: str) -> None:
         assert cells == expected([record for record in records if record["arm"] == arm]), arm
 
 
+def test_the_rates_of_mt10_are_those_of_the_committed_rollouts() -> None:
+    records = read_records([ROOT / "results" / "mt10" / "records.jsonl"])
+    readme = (ROOT / "README.md").read_text().split("**MT10**")[1].split("\n\n")[0].replace("%", "")
+    page = (ROOT / "results" / "mt10" / "README.md").read_text().split("| task |")[1].split("\n\n")[0]
+    arms = [cell.strip(" `") for cell in page.splitlines()[0].split("|")[:-1]]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()[2:]]
+    assert {task for task, *_ in rows} >= set(resolve_tasks("mt10"))
+    for task, *cells in rows:
+        for arm, cell in zip(arms, cells, strict=True):
+            chosen = [r for r in records if r["arm"] == arm]
+            if task in resolve_tasks("mt10"):
+                chosen = [r for r in chosen if r["task"] == task]
+            elif task != "all":
+                chosen = [r for r in chosen if in_split(r, task.split()[2])]
+            assert cell == str(success_rate(chosen)), (task, arm)
+    for arm in ("wm_iql", "wm_bc"):
+        assert f"`{arm}` {success_rate(r for r in records if r['arm'] == arm)}" in readme
+
+
 def test_readme_shows_the_committed_measurements() -> None:
     """Peer, ours, peer's, ratio: the cells of a line are those of one line of the whole table."""
 
