@@ -9,6 +9,7 @@ from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.scripts.lerobot_train import train as lerobot_train
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.logging_utils import MetricsTracker
 
 from lerobot_wm.constants import OBS_LATENT
@@ -85,7 +86,7 @@ def check_latents_are_there(cfg: TrainPipelineConfig) -> None:
         return
     raise FileNotFoundError(
         f"{root} is gone, the latents that this training reads. To go on, make them again: lerobot-wm encode "
-        f"--world_model_path={cfg.checkpoint_path / 'pretrained_model'} --dataset.repo_id=... --dataset.root=... "
+        f"--world_model_path={cfg.checkpoint_path / PRETRAINED_MODEL_DIR} --dataset.repo_id=... --dataset.root=... "
         f"--output_repo_id={cfg.dataset.repo_id} --output_root={root}, with the dataset of images as --dataset."
     )
 

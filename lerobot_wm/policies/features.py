@@ -20,14 +20,15 @@ def default_dtype(device: str) -> str:
     return "bfloat16" if device == "cpu" and torch.cpu._is_avx512_bf16_supported() else "float32"
 
 
-def check_dtype(dtype: str) -> None:
-    """Refuse autocast types that training does not know; LeRobot and accelerate take unknown ones for float32.
+def training_dtype(dtype: str | None, device: str) -> str:
+    """The autocast type of training: `dtype`, or the device's default where it is None.
 
     Raises:
-        ValueError: It is neither of the two.
+        ValueError: It is not known; LeRobot and accelerate would take it for float32.
     """
-    if dtype not in ("bfloat16", "float32"):
+    if dtype not in (None, "bfloat16", "float32"):
         raise ValueError(f"dtype is '{dtype}'; expected 'bfloat16' or 'float32'.")
+    return dtype or default_dtype(device)
 
 
 def feature_dim(features: dict[str, PolicyFeature], key: str, where: str) -> int:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from lerobot.optim import LRSchedulerConfig
 
 from lerobot_wm.constants import ACTION, OBS_STATE
-from lerobot_wm.policies.features import check_dtype, default_dtype, feature_dim
+from lerobot_wm.policies.features import feature_dim, training_dtype
 from lerobot_wm.policies.optim import FusedAdamConfig
 from lerobot_wm.policies.single_frames import SingleFramesConfig
 
@@ -37,9 +37,7 @@ class MultiTaskConfig(SingleFramesConfig):
         super().__post_init__()
         if self.action_noise < 0:
             raise ValueError(f"action_noise is {self.action_noise:g}; a standard deviation is 0 or more.")
-        if self.dtype is None:
-            self.dtype = default_dtype(str(self.device))
-        check_dtype(self.dtype)
+        self.dtype = training_dtype(self.dtype, str(self.device))
 
     @property
     def state_dim(self) -> int:

@@ -17,7 +17,7 @@ from lerobot_wm.policies.cameras import camera_images, side_by_side
 from lerobot_wm.policies.frozen_encoder import load_encoder
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.report.episodes import episodes_by_task
+from lerobot_wm.report.episodes import episodes_by_task, shapes_read
 from lerobot_wm.world_model.model import WorldModel
 
 CONTEXT = 5  # frames the model sees
@@ -58,13 +58,6 @@ def load_world_model(path: str) -> WMRSSMPolicy | LatentPolicy:
     return policy.eval()
 
 
-def keys_read(policy: WMRSSMPolicy | LatentPolicy) -> list[str]:
-    """What the world model of a checkpoint reads of an episode."""
-    assert isinstance(policy.world_model, WorldModel)  # as load_world_model checked
-    proprio = [OBS_STATE] if policy.world_model.config.use_proprio else []
-    return [*policy.config.cameras, ACTION, *proprio]
-
-
 def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | None) -> list[OpenLoop]:
     """Predict the last episodes of each task (those LeRobot's `eval_split` holds out).
 
@@ -77,7 +70,7 @@ def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | Non
         raise ValueError(f"{repo_id} has no episode of {WINDOW} frames, which open-loop prediction needs.")
     first_frame = meta.episodes["dataset_from_index"][:]
     times = [step / meta.fps for step in range(WINDOW)]
-    dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(keys_read(policy), times))
+    dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(shapes_read(policy), times))
     return [
         predict(policy, task, [dataset[first_frame[i]] for i in episodes[-EPISODES_PER_TASK:]])
         for task, episodes in tqdm(by_task.items(), desc="Imagining", unit="task")
@@ -91,13 +84,12 @@ def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[s
     Args:
         policy: holds the world model.
         task: what the windows show.
-        windows: each the first WINDOW frames of an episode: every camera (T, C, H, W) in [0, 1], `action` (T, A),
-            `observation.state` (T, P) where the world model reads it.
+        windows: each the first WINDOW frames of an episode: what `shapes_read` names, (T, ·), images in [0, 1].
     """
     config, world_model = policy.config, policy.world_model
     assert isinstance(world_model, WorldModel)  # as load_world_model checked
     batch = {
-        key: torch.stack([window[key] for window in windows]).to(config.device) for key in keys_read(policy)
+        key: torch.stack([window[key] for window in windows]).to(config.device) for key in shapes_read(policy)
     }
     images, actions = camera_images(config, batch), batch[ACTION]  # (B, T, C, 64, 64), (B, T, A)
     proprio = batch[OBS_STATE][:, :CONTEXT] if world_model.config.use_proprio else None

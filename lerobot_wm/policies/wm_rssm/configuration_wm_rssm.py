@@ -8,7 +8,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.compile import CompileConfig
-from lerobot_wm.policies.features import check_dtype, default_dtype, feature_dim
+from lerobot_wm.policies.features import feature_dim, training_dtype
 from lerobot_wm.policies.lr_decay import LRDecayConfig
 from lerobot_wm.policies.optim import FusedAdamConfig
 from lerobot_wm.policies.rewards import RewardConfig
@@ -45,9 +45,7 @@ class WMRSSMConfig(LRDecayConfig, CompileConfig, WorldModelConfig, RewardConfig)
         super().__post_init__()
         if self.window_length < 2:
             raise ValueError(f"window_length is {self.window_length}; a window needs at least 2 steps.")
-        if self.dtype is None:
-            self.dtype = default_dtype(str(self.device))
-        check_dtype(self.dtype)
+        self.dtype = training_dtype(self.dtype, str(self.device))
         self.drop_n_last_frames = self.window_length - 1  # no setting: read by LeRobot's sampler
 
     def fit_windows(self, shortest_episode: int) -> None:
