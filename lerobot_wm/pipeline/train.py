@@ -18,6 +18,7 @@ from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.hub.errors import check_can_push, check_dataset_version
 from lerobot_wm.pipeline.accelerator import RamAccelerator, make_accelerator
 from lerobot_wm.pipeline.encode import LATENTS_PREFIX, encode_to_cache
+from lerobot_wm.pipeline.memory import keep_freed_memory
 from lerobot_wm.pipeline.processors import check_policy_path, check_processors
 from lerobot_wm.pipeline.train_resume import clear_unfinished, how_to_go_on, restore_last, stops_explained
 from lerobot_wm.pipeline.training_run import check_run_settings, check_training_state
@@ -157,4 +158,5 @@ def main() -> None:
         check_run_settings(config_path)
         _check_resumes_into_a_folder(config_path)
     check_policy_path()
+    keep_freed_memory()
     train()
