@@ -4,12 +4,15 @@ PNG images of 480x480, a dense next.reward, next.success, and no next.done: the 
 """
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -19,7 +22,7 @@ from lerobot_wm.policies.iql_agent import Outcomes
 from lerobot_wm.policies.rewards import FrameLabel
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import SMALL_WORLD_MODEL
-from tests.recording import camera, record, train_flags, vector
+from tests.recording import FRONT, camera, record, train_flags, vector
 
 Command = Callable[..., None]
 CHECKPOINT = Path("checkpoints", "last", "pretrained_model")
@@ -159,3 +162,32 @@ def test_a_reward_that_is_not_there(
             f"train --policy.type={policy_type} --policy.reward_key=next.dense_reward --steps=1 {flags}",
             f"--output_dir={tmp_path / 'run'}",
         )
+
+
+def test_where_a_task_ends_can_be_named(tmp_path: Path) -> None:
+    """LeRobot's recorders set next.done at a time limit, too."""
+    keys = {"next.reward": vector(1), "next.done": vector(1, "bool"), "next.success": vector(1, "bool")}
+    features = {FRONT: camera(32, 32), "observation.state": vector(3), "action": vector(2), **keys}
+
+    def out_of_time(t: int, length: int) -> dict[str, Any]:
+        return {"next.done": np.array([t == length - 1]), "next.success": np.array([False])}
+
+    failed = record(tmp_path / "failed", features, [("Reach", 4)], out_of_time)
+    batch = {
+        "index": torch.arange(4),
+        "next.done": torch.tensor([0.0, 0, 0, 1]),
+        "next.reward": torch.zeros(4),
+    }
+    for done_key, expected in ((None, [False, False, False, True]), ("next.success", [False] * 4)):
+        config = make_policy_config("e2e_iql", done_key=done_key, device="cpu")
+        assert Outcomes(config, failed.meta)(batch)[1].tolist() == expected
+    with pytest.raises(ValueError, match=r"has no next\.over"):
+        Outcomes(make_policy_config("e2e_iql", done_key="next.over", device="cpu"), failed.meta)
+
+
+def test_labels_without_tables_are_no_zeros(dataset: LeRobotDataset, tmp_path: Path) -> None:
+    """Of a dataset that is streamed only the metadata is here."""
+    shutil.copytree(Path(dataset.root) / "meta", tmp_path / "meta")
+    meta = LeRobotDatasetMetadata("test/streamed", root=tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"has no tables, and next\.success is read from them"):
+        Outcomes(make_policy_config("e2e_iql", device="cpu"), meta)

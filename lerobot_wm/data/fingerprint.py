@@ -1,20 +1,29 @@
 """Content hashes that tie latents to the world model and the dataset they came from."""
 
 import hashlib
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
 _HEX_DIGITS = 16
 
 
-def weights_fingerprint(module: nn.Module) -> str:
-    """Hash of every parameter and buffer: names, shapes, types and bytes. 16 hexadecimal digits."""
+def weights_fingerprint(module: nn.Module, settings: Mapping[str, Any] | None = None) -> str:
+    """Hash of every parameter and buffer: names, shapes, types and bytes. 16 hexadecimal digits.
+
+    Args:
+        module: The module.
+        settings: What else decides what it computes.
+    """
     digest = hashlib.sha256()
     for name, tensor in sorted(module.state_dict().items()):
         digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}\n".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    for name, value in sorted((settings or {}).items()):
+        digest.update(f"{name} = {value}\n".encode())
     return digest.hexdigest()[:_HEX_DIGITS]
 
 

@@ -12,7 +12,7 @@ class LatentRecord:
     """Provenance of a latent dataset, kept in its `meta/latents.json`.
 
     Attributes:
-        world_model_fingerprint: `weights_fingerprint` of the encoding world model.
+        world_model_fingerprint: `weights_fingerprint` of the encoding world model and its `encoding_settings`.
         source_repo_id: The dataset that was encoded.
         source_fingerprint: `dataset_fingerprint` of it.
         tasks: Its task strings, in order of task_index.
@@ -63,4 +63,16 @@ class LatentRecord:
                 f"These latents were encoded by world model {self.world_model_fingerprint}, but {path} is world model "
                 f"{fingerprint}. A policy would act on states it was never trained on: encode {self.source_repo_id} "
                 "with this world model, or pass the world model the latents are of."
+            )
+
+    def check_cameras(self, cameras: list[str], path: str | None) -> None:
+        """Refuse latents of other cameras' images; older records do not tell whose they are.
+
+        Raises:
+            ValueError: The cameras differ.
+        """
+        if self.camera_shapes and list(self.camera_shapes) != cameras:
+            raise ValueError(
+                f"These latents are of the images of {', '.join(self.camera_shapes)}, but {path} sees "
+                f"{', '.join(cameras)}: encode {self.source_repo_id} with this world model."
             )

@@ -83,7 +83,6 @@ class RamDataset:
         starts = torch.searchsorted(episode, episode)  # rows of an episode are consecutive
         stops = torch.searchsorted(episode, episode, right=True)
         self._first, self._last = starts, stops - 1  # (N,) per row: first and last row of its episode
-        self._to_absolute = self._columns["index"] - torch.arange(len(episode), device=device)  # (N,)
 
     def batch(self, rows: list[int]) -> dict[str, Any]:
         """The collated batch of these dataset indices: LeRobot's keys, shapes, types and values."""
@@ -116,7 +115,7 @@ class RamDataset:
     def _images(self, key: str, rows: Tensor) -> Tensor:
         """Frames (B, C, H, W) or (B, T, C, H, W): a channels-first view of channels-last memory."""
         frames = self._cameras[key]
-        images = gather(frames, (rows + self._to_absolute[rows]).to(frames.device)).to(self.device)
+        images = gather(frames, self._columns["index"][rows].to(frames.device)).to(self.device)
         images = images.movedim(-1, -3)
         return images.float() / 255 if key in self._float_cameras else images
 

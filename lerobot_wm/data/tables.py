@@ -43,10 +43,19 @@ def frame_numbers(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
         key: The column.
 
     Returns:
-        (N,) float32 by absolute frame index; zero for frames whose files are not here.
+        (N,) float32 by absolute frame index; zero for episodes that were not downloaded.
+
+    Raises:
+        FileNotFoundError: None of its tables is here.
     """
     numbers = torch.zeros(meta.total_frames)
-    for path in sorted((Path(meta.root) / "data").rglob("*.parquet")):
+    paths = sorted((Path(meta.root) / "data").rglob("*.parquet"))
+    if not paths:
+        raise FileNotFoundError(
+            f"{Path(meta.root) / 'data'} has no tables, and {key} is read from them: train without "
+            f"--dataset.streaming=true, or download {meta.repo_id} to that folder first."
+        )
+    for path in paths:
         table = pq.read_table(path, columns=["index", key])
         index, values = (
             np.concatenate([_flat_values(chunk) for chunk in table[name].chunks]) for name in ("index", key)

@@ -147,18 +147,24 @@ class MetaworldMTEnv(gym.Env):
     def close(self) -> None:
         """Free the simulator and its OpenGL memory; a later reset builds them again."""
         if self._sim is not None:
-            for key in self._render_keys.values():
-                Renderer.release(key)
+            for camera in self._renderers:
+                Renderer.release(self._render_keys[camera])
             self._renderers = {}
             self._sim = None
 
     def _build(self) -> None:
         from lerobot_wm.envs.simulation import Simulation
 
-        self._sim = Simulation(self.task, self._variation_set)
-        self._renderers = {
-            camera: Renderer.acquire(key, self._sim.model) for camera, key in self._render_keys.items()
-        }
+        sim = Simulation(self.task, self._variation_set)
+        renderers: dict[str, Renderer] = {}
+        try:
+            for camera, key in self._render_keys.items():
+                renderers[camera] = Renderer.acquire(key, sim.model)
+        except BaseException:
+            for camera in renderers:
+                Renderer.release(self._render_keys[camera])
+            raise
+        self._sim, self._renderers = sim, renderers
 
     def _observe(self) -> Observation:
         assert self._sim is not None

@@ -139,7 +139,7 @@ def _begin(
 def _record(policy: EncoderPolicy, source: LeRobotDataset, sample_seed: int | None) -> LatentRecord:
     features = dataset_to_policy_features(source.meta.features)
     return LatentRecord(
-        world_model_fingerprint=weights_fingerprint(policy.world_model),
+        world_model_fingerprint=weights_fingerprint(policy.world_model, policy.world_model.encoding_settings),
         source_repo_id=source.repo_id,
         source_fingerprint=dataset_fingerprint(Path(source.root)),
         tasks=[str(task) for task in source.meta.tasks.index],
@@ -164,7 +164,8 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
     root = Path(meta.root)
     # Opened before it is hashed: of a dataset of the Hub only the metadata may be here yet.
     source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
-    name = f"{LATENTS_PREFIX}{weights_fingerprint(policy.world_model)}-{dataset_fingerprint(root)}"
+    settings = {**policy.world_model.encoding_settings, "cameras": policy.config.cameras}
+    name = f"{LATENTS_PREFIX}{weights_fingerprint(policy.world_model, settings)}-{dataset_fingerprint(root)}"
     output_root = cache_root(root) / name
     with sole_writer(output_root, wait=True):  # another training may be encoding it
         if output_root.is_dir():

@@ -69,6 +69,8 @@ class E2EPolicy(MultiTaskPolicy):
         Raises:
             ValueError: A camera is missing or has another size than in training, or the task is unknown.
         """
+        if self.training:  # no dropout and no random shifts, as LeRobot's policies act
+            self.eval()
         check_observation(self.config, batch)
         images, state = camera_images(self.config, batch), batch[OBS_STATE]
         observation = self.observation(images, state, self.one_hot_tasks(batch, state.shape[0]))

@@ -8,6 +8,8 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import ACTION
 from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.iql_config import IQLConfig
+from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
 
 def fit_to_dataset(
@@ -62,6 +64,33 @@ def check_sizes(
             raise ValueError(
                 f"This {saved.type} was trained with '{key}' of size {known.shape[0]}, {dataset_meta.repo_id} has it "
                 f"with {found.shape[0]}: {mend}."
+            )
+
+
+def check_kept(config: PreTrainedConfig, saved: PreTrainedConfig) -> None:
+    """Refuse to change what a checkpoint holds: a policy's world model, and the β of its actors.
+
+    Args:
+        config: The configuration to act or train with.
+        saved: As it is in the checkpoint.
+
+    Raises:
+        ValueError: A setting names another world model, or a β without an actor.
+    """
+    anew = f"train a new {saved.type}, --policy.type={saved.type} in place of --policy.path"
+    both_on_latents = isinstance(saved, LatentPolicyConfig) and isinstance(config, LatentPolicyConfig)
+    if both_on_latents and config.world_model_path != saved.world_model_path:
+        raise ValueError(
+            f"--policy.world_model_path={config.world_model_path}: the policy of --policy.path has its world model in "
+            f"it, {saved.world_model_path}, and was fitted to it. Leave the flag out, or {anew}."
+        )
+    if isinstance(saved, IQLConfig) and isinstance(config, IQLConfig):
+        untrained = [beta for beta in config.sweep_betas if beta not in saved.trained_betas]
+        if untrained:
+            raise ValueError(
+                f"--policy.sweep_betas: no actor of the policy of --policy.path was trained with beta "
+                f"{', '.join(f'{beta:g}' for beta in untrained)}; it has actors for "
+                f"{', '.join(f'{beta:g}' for beta in saved.trained_betas)}. Leave the flag out, or {anew}."
             )
 
 

@@ -14,7 +14,7 @@ from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.tasks import resolve_tasks, task_description
 from lerobot_wm.policies.cameras import ImagePolicyConfig, check_observation
 from lerobot_wm.policies.checkpoint import read_config
-from lerobot_wm.policies.fine_tuning import check_sizes, fit_to_dataset
+from lerobot_wm.policies.fine_tuning import check_kept, check_sizes, fit_to_dataset
 from lerobot_wm.policies.iql_agent import end_column
 from lerobot_wm.policies.iql_config import IQLConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
@@ -44,6 +44,7 @@ def check_dataset_fits(
         return
     saved = read_config(config.pretrained_path, config.pretrained_revision)
     assert isinstance(saved, ImagePolicyConfig)  # LeRobot has read it, as `config`
+    check_kept(config, saved)
     if OBS_LATENT not in dataset_meta.features:
         cameras = [rename_map.get(key, key) for key in dataset_meta.camera_keys]
         _check_cameras(saved, cameras, dataset_meta.repo_id)
@@ -108,7 +109,7 @@ def check_environment_fits(config: PreTrainedConfig, env: EnvConfig, rename_map:
     check_observation(config, {key: torch.empty(1, *feature.shape) for key, feature in features.items()})
     if isinstance(config, LatentPolicyConfig):
         config.check_environment_state(features)
-    if isinstance(config, MultiTaskConfig) and len(config.tasks) > 1:
+    if isinstance(config, MultiTaskConfig):
         config.check_tasks({task_description(task) for task in resolve_tasks(env.task)})
 
 

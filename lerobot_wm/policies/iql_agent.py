@@ -3,9 +3,10 @@
 from typing import Any
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.utils.constants import OBS_STR
 from torch import Tensor, nn
 
-from lerobot_wm.constants import DONE, OBS_STATE, SUCCESS
+from lerobot_wm.constants import DONE, SUCCESS
 from lerobot_wm.policies.iql_config import IQLConfig
 from lerobot_wm.policies.parts import logged
 from lerobot_wm.policies.rewards import FrameLabel, reward_columns
@@ -45,7 +46,7 @@ def make_agent(config: IQLConfig, observation_dim: int) -> IQLAgent:
 class Outcomes(nn.Module):
     """What came of an action, in training: its reward, and whether it ended the task.
 
-    A task ends where `next.done` is true or, in a dataset without it, `next.success`.
+    A task ends where the configuration's `done_key` is true.
 
     Args:
         config: The policy's configuration.
@@ -73,11 +74,11 @@ def end_column(config: IQLConfig, dataset_meta: LeRobotDatasetMetadata) -> str:
         ValueError: The dataset lacks the reward, or does not tell where a task ends.
     """
     features, known = dataset_meta.features, reward_columns(dataset_meta)
-    end = DONE if DONE in features else SUCCESS
+    end = config.done_key or (DONE if DONE in features else SUCCESS)
     missing = [] if config.reward_key in known else [config.reward_key]
-    missing += [] if end in features else [f"{DONE} or {SUCCESS}"]
+    missing += [] if end in {*known, DONE} & features.keys() else [config.done_key or f"{DONE} or {SUCCESS}"]
     if missing:
-        choice = f"set --policy.reward_key to one of {', '.join(known)}, " if known else ""
+        choice = f"set --policy.reward_key or done_key to one of {', '.join(known)}, " if known else ""
         raise ValueError(
             f"{config.type} learns from rewards, but {dataset_meta.repo_id} has no {' and no '.join(missing)}: "
             f"{choice}add what is missing to the dataset, or train "
@@ -103,7 +104,7 @@ def batch_loss(
         next_observation: At t+1, (B, O).
         action: Scaled to [-1, 1], (B, A).
         batch: `next.reward` (B,) and `next.done` (B,), or `index` (B,) where other columns are read in their place;
-            `observation.state_is_pad` (B, 2) at t and t+1.
+            an observation's `_is_pad` (B, 2) at t and t+1.
     """
     reward, terminal = outcomes(batch)  # (B,) each
     loss, parts = agent.loss(
@@ -112,6 +113,15 @@ def batch_loss(
         action,
         reward=reward,
         terminal=terminal,
-        has_next=~batch[f"{OBS_STATE}_is_pad"][:, 1],
+        has_next=~_past_the_end(batch),
     )
     return loss, logged(parts)
+
+
+def _past_the_end(batch: dict[str, Any]) -> Tensor:
+    """Where t+1 lies beyond the episode, (B,) bool; all observations are read at the same times.
+
+    Names of observations may have been changed by `--rename_map`, which leaves those of their padding as they are.
+    """
+    names = (key for key in batch if key.startswith(f"{OBS_STR}.") and key.endswith("_is_pad"))
+    return batch[next(names)][:, 1]

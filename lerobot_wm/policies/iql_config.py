@@ -22,6 +22,9 @@ class IQLConfig(RewardConfig, MultiTaskConfig):
         expectile: Expectile τ of the value regression.
         discount: γ.
         target_rate: Polyak rate of the target critics.
+        done_key: The dataset's column that is true where an action ended the task, not where time ran out. None takes
+            next.done or, in a dataset without it, next.success. LeRobot's own recorders set next.done at a time limit,
+            too: next.success for these.
         trained_betas: β of every actor, the main one first; filled when the policy is made.
     """
 
@@ -30,7 +33,20 @@ class IQLConfig(RewardConfig, MultiTaskConfig):
     expectile: float = 0.7
     discount: float = 0.99
     target_rate: float = 0.005
+    done_key: str | None = None
     trained_betas: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.expectile < 1:
+            raise ValueError(f"expectile is {self.expectile:g}; it is above 0 and below 1.")
+        if not 0 <= self.discount <= 1:
+            raise ValueError(f"discount is {self.discount:g}; it is between 0 and 1.")
+        if not 0 < self.target_rate <= 1:
+            raise ValueError(f"target_rate is {self.target_rate:g}; it is above 0 and at most 1.")
+        for beta in (self.beta, *self.sweep_betas):
+            if beta < 0:
+                raise ValueError(f"beta is {beta:g}; it is 0 or more, for it prefers what has an advantage.")
 
     @property
     def observation_delta_indices(self) -> list[int]:

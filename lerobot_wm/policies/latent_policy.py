@@ -144,6 +144,8 @@ class LatentPolicy(MultiTaskPolicy):
             ValueError: A camera is missing or has another size than in training, the task is unknown, or the full
                 state is missing.
         """
+        if self.training:  # no dropout, as LeRobot's policies act
+            self.eval()
         state = batch[OBS_STATE]
         latent = self._filter(batch) if self.config.use_latent else None
         env_state = self._env_state(batch) if self.config.use_environment_state else None

@@ -38,7 +38,9 @@ def take_world_model(config: LatentPolicyConfig) -> LatentModel:
     )
     config.image_key = policy.config.image_key
     config.input_features |= {key: policy.config.input_features[key] for key in policy.config.cameras}
-    config.world_model_fingerprint = weights_fingerprint(policy.world_model)
+    config.world_model_fingerprint = weights_fingerprint(
+        policy.world_model, policy.world_model.encoding_settings
+    )
     return policy.world_model
 
 
@@ -78,6 +80,7 @@ def check_latents(config: LatentPolicyConfig, dataset_meta: LeRobotDatasetMetada
             f"{record.source_repo_id} again."
         )
     record.check_world_model(config.world_model_fingerprint, config.world_model_path)
+    record.check_cameras(config.cameras, config.world_model_path)
     for key, shape in record.camera_shapes.items():
         config.input_features[key] = PolicyFeature(FeatureType.VISUAL, tuple(shape))
     if config.scales_latents:

@@ -22,7 +22,8 @@ class MultiTaskConfig(SingleFramesConfig):
             [-1, 1]. Demonstrations that were collected with noise show how to act under it, and a policy that hovers
             where no demonstration ends gets free.
         lr: Learning rate of Adam.
-        dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in.
+        dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in, once: a
+            checkpoint keeps it.
         tasks: Task strings in one-hot order, taken from the dataset when the policy is made.
     """
 

@@ -104,10 +104,12 @@ class MultiTaskPolicy(StrictPolicy):
         return self.action_scaling.inverse(noisy.clamp(-1, 1))
 
     def one_hot_tasks(self, batch: dict[str, Any], batch_size: int) -> Tensor:
-        """One-hot task ids (B, N) from the batch's task strings; one known task needs no string.
+        """One-hot task ids (B, N) from the batch's task strings.
+
+        A policy that knows one task does it whatever it is told: simulators name theirs in other words.
 
         Raises:
-            ValueError: A task string is missing or is not one the policy was trained on.
+            ValueError: A policy of several tasks is given no string, or one that it was not trained on.
         """
         known = self.config.tasks
         given = batch.get(TASK) or [""] * batch_size  # lerobot-rollout gives "" where it was given none

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 
 from lerobot_wm.hub.model_card import TrainingData, model_card
 from lerobot_wm.policies.checkpoint import WHOLE, not_finite, read_config
-from lerobot_wm.policies.fine_tuning import check_action_size, fit_to_dataset
+from lerobot_wm.policies.fine_tuning import check_action_size, check_kept, fit_to_dataset
 from lerobot_wm.policies.world_model_config import WorldModelConfig
 
 # What `from_pretrained` is told of the Hub, for each file.
@@ -64,6 +64,10 @@ class StrictPolicy(PreTrainedPolicy):
                 f"it as what it is, --policy.type={saved.type}."
             )
         config = config or deepcopy(saved)
+        kwargs.pop(
+            "dataset_stats", None
+        )  # the checkpoint's own hold; these may have other names (--rename_map)
+        check_kept(config, saved)
         if dataset_meta is None:
             check_action_size(config, saved)
         else:

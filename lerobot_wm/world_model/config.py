@@ -26,7 +26,7 @@ class RSSMConfig:
         action_dropout: Share of the training windows in which the recurrence is not told the actions. Above 0 it is
             never told them where it filters. A demonstrator's action tells where the goal is as well as the image does:
             a model that is always told it has no reason to look, and a policy on its latents copies its own last
-            action. Imagination is told the actions in any case.
+            action. Imagination is told the actions in any case; at 1 nothing was learned of what they do.
         action_scale: Weight of the action loss: a head predicts a_t from s_t, so that s_t holds what the demonstrator
             acted on, however small it is in the image. 0: no such head.
         image_shift: Pixels by which each training frame is shifted at random, up or down and left or right, before it
@@ -35,6 +35,9 @@ class RSSMConfig:
             places in a fixed camera's image: the shift moves the place and not the action.
         predict_reward: Whether there is a reward head (turned off for datasets without `next.reward`).
         use_proprio: Encode and reconstruct proprioception beside the image (the paper's discarded variant).
+        centred_start: What stands for the action before an episode is the middle of the actions' range. Filled when a
+            model is made new; those of release 0.1.0 were trained with zeros in the dataset's units, which for joint
+            angles may be far from all that the robot was ever told.
         image_channels: Channels of the image; filled from the dataset.
         action_dim: Size of the action; filled from the dataset.
         proprio_dim: Size of the proprioceptive state; filled from the dataset when `use_proprio`.
@@ -56,6 +59,7 @@ class RSSMConfig:
     image_shift: int = 0
     predict_reward: bool = True
     use_proprio: bool = False
+    centred_start: bool = False
     image_channels: int = 0
     action_dim: int = 0
     proprio_dim: int = 0
@@ -71,6 +75,11 @@ class RSSMConfig:
             raise ValueError(
                 f"action_dropout is {self.action_dropout:g}; a share of windows is between 0 and 1."
             )
+        if self.min_std <= 0:
+            raise ValueError(f"min_std is {self.min_std:g}; a standard deviation is above 0.")
+        for name in ("kl_scale", "free_nats", "reward_scale", "image_error_weight", "action_scale"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name):g}; it is 0 or more.")
 
     @property
     def latent_dim(self) -> int:

@@ -37,6 +37,11 @@ class LatentModel(nn.Module, ABC):
     (B, T, A) and proprioception (B, T, P) are in the dataset's units. A model ignores what it does not read.
     """
 
+    @property
+    def encoding_settings(self) -> dict[str, Any]:
+        """What decides the latents of an image beside the weights; latents of other settings are another model's."""
+        return {}
+
     @abstractmethod
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
         """Embeddings e_t, each of its own frame alone: (B, T, E)."""
@@ -55,7 +60,7 @@ class LatentModel(nn.Module, ABC):
     ) -> LatentState:
         """States (B, T, ·) for the next frames, given the action a_{t-1} before each and the state before the first.
 
-        Where an episode starts, the state is None and the action zero.
+        Where an episode starts, the state is None and the action, which nobody took, is zeros that mean nothing.
         """
 
     def expected_images(self, state: Any) -> Tensor:

@@ -1,6 +1,7 @@
 """The world model: image encoder, RSSM, image decoder and reward head (paper section 3.1.1)."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +20,8 @@ class WorldModel(LatentModel):
     """An RSSM on images and actions only: no task id, and no proprioception unless `config.use_proprio`.
 
     Time: frame t holds the image o_t, the action a_t executed there and the reward r_t that arrives with
-    o_{t+1}. The filter reads (s_{t-1}, a_{t-1}, o_t), with a_{-1} = 0; the reward head predicts r_{t-1} from s_t.
+    o_{t+1}. The filter reads (s_{t-1}, a_{t-1}, o_t); a_{-1}, which nobody took, is the middle of the actions' range
+    (`config.centred_start`). The reward head predicts r_{t-1} from s_t.
 
     Actions, proprioception and images enter in the dataset's own units; `action_scaling`, `proprio_scaling` and
     `image_scaling` hold the statistics that normalise them, so that a checkpoint needs nothing beside itself.
@@ -42,6 +44,11 @@ class WorldModel(LatentModel):
             self.proprio_scaling = Affine(config.proprio_dim)
             self.proprio_fusion = MLP(EMBED_DIM + config.proprio_dim, [EMBED_DIM], EMBED_DIM)
             self.proprio_decoder = MLP(config.latent_dim, [config.hidden_dim] * 2, config.proprio_dim)
+
+    @property
+    def encoding_settings(self) -> dict[str, Any]:
+        """Whether the filter is told the actions."""
+        return {"hidden_actions": True} if self.config.action_dropout > 0 else {}
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
         """Image embeddings e_t.
@@ -74,7 +81,7 @@ class WorldModel(LatentModel):
 
         Args:
             images: o_t, (B, T, C, 64, 64) in [0, 1].
-            prev_actions: a_{t-1}, (B, T, A) in the dataset's units; zero where an episode starts.
+            prev_actions: a_{t-1}, (B, T, A) in the dataset's units; the first is not read where an episode starts.
             state: s before the first frame, (B, ·); None starts an episode.
             proprio: (B, T, P), with `config.use_proprio`.
             sample: Draw z_t instead of taking the posterior mean.
@@ -119,7 +126,10 @@ class WorldModel(LatentModel):
         return self._decode(latents).clamp(0, 1)
 
     def expected_images(self, state: RSSMState) -> Tensor:
-        """What o_t was expected to be, from s_{t-1} and a_{t-1} alone: (B, C, 64, 64) for the s_t (B, ·) it led to."""
+        """What o_t was expected to be before it was seen: (B, C, 64, 64) for the s_t (B, ·) it led to.
+
+        From s_{t-1} and a_{t-1} alone; with `action_dropout` above 0 the filter is not told a_{t-1} either.
+        """
         # d_t does not depend on o_t; z_t as expected without it is the prior's.
         return self.decode(RSSMState(state.deter, self.rssm.prior(state.deter).mean).latent)
 
@@ -137,7 +147,8 @@ class WorldModel(LatentModel):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The training loss on windows: reconstruction, reward and KL with free nats.
 
-        A window starts from the zero state and a zero previous action, wherever in its episode it lies.
+        A window starts from the zero state and a zero previous action, wherever in its episode it lies. The reward
+        loss is averaged over all T frames, though the first has none: it weighs (T-1)/T of `reward_scale`.
 
         Args:
             images: (B, T, C, 64, 64) in [0, 1].
@@ -219,6 +230,8 @@ class WorldModel(LatentModel):
         """The RSSM's `observe`, from scaled actions a_{t-1} (B, T, A) as far as it is told them; None starts anew."""
         if state is None:
             state = self.rssm.initial_state(embeds.shape[0])
+            if self.config.centred_start:
+                prev_actions = nn.functional.pad(prev_actions[:, 1:], (0, 0, 1, 0))
         return self.rssm.observe(embeds, self._told(prev_actions), state, sample=sample)
 
     def _told(self, prev_actions: Tensor) -> Tensor:

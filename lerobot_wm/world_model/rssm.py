@@ -35,10 +35,6 @@ class RSSMState:
         """The final step of a sequence, (B, ·)."""
         return RSSMState(self.deter[:, -1], self.stoch[:, -1])
 
-    def detach(self) -> "RSSMState":
-        """The same state without its history of gradients."""
-        return RSSMState(self.deter.detach(), self.stoch.detach())
-
 
 @dataclass
 class DiagonalNormal:

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,3 +122,24 @@ def test_hand_cameras_move_with_the_hand(make_env: MakeEnv, camera: str) -> None
         positions[-1] - positions[0], moved, atol=0.02
     )  # the hand swings a little at the wrist
     assert not np.array_equal(first["pixels"], observation["pixels"])
+
+
+def test_a_renderer_that_cannot_be_made_leaves_nothing_behind(
+    make_env: MakeEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each reset says what is wrong, `close` says nothing, and a renderer that was made is given back."""
+    env = make_env("reach-v3", camera_name="corner2,topview")
+    before = dict(rendering._renderers)
+    acquire = rendering.Renderer.acquire
+
+    def second_fails(key: rendering.RenderKey, model: Any) -> rendering.Renderer:
+        if key.camera == "topview":
+            raise RuntimeError("no OpenGL")
+        return acquire(key, model)
+
+    monkeypatch.setattr(rendering.Renderer, "acquire", second_fails)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="no OpenGL"):
+            env.reset(seed=0)
+    env.close()
+    assert rendering._renderers == before

@@ -283,3 +283,9 @@ def test_both_training_commands(
     )
     assert action.shape == (1, 4)
     assert (action.abs() <= 1 + 1e-6).all()
+
+
+def test_a_policy_left_in_training_mode_acts_without_dropout_and_crops() -> None:
+    policy, batch = make_policy("e2e_bc", random_crop_pad=4), seen()
+    expected = policy.eval().select_action(batch)
+    assert torch.equal(policy.train().select_action(batch), expected)

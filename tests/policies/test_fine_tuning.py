@@ -1,5 +1,6 @@
 """Training that goes on from a checkpoint, with another dataset: other tasks, other camera sizes, no reward."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -268,3 +269,56 @@ def test_inserted_inputs_change_nothing() -> None:
     torch.testing.assert_close(mlp(wider), before)
     mlp(wider).sum().backward()
     assert mlp.trunk[0].weight.grad[:, 3:5].any()
+
+
+def test_what_a_checkpoint_holds_cannot_be_changed(
+    checkpoints: dict[str, Path], encoded: tuple, known: LeRobotDataset
+) -> None:
+    """Its world model stays, and no actor is added."""
+    dataset = encoded[1](known)
+    for policy_type, change, message in (
+        ("wm_bc", {"world_model_path": "another"}, "world_model_path=another: .* has its world model in it"),
+        ("wm_iql", {"sweep_betas": [3.0]}, "no actor .* was trained with beta 3; it has actors for 0.5"),
+    ):
+        config = PreTrainedConfig.from_pretrained(checkpoints[policy_type])
+        config.pretrained_path = checkpoints[policy_type]
+        for name, value in change.items():
+            setattr(config, name, value)
+        with pytest.raises(ValueError, match=message):
+            make_policy(config, ds_meta=dataset.meta)
+
+
+def test_a_world_model_of_scaled_images_goes_on_with_renamed_cameras(
+    folder: Path, known: LeRobotDataset, tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    """The statistics that scale are the checkpoint's: the dataset's have other names."""
+    lerobot_wm_command(
+        f"init --policy.type=wm_rssm {SMALL_WORLD_MODEL} --policy.window_length=4 --policy.device=cpu",
+        f"--policy.rssm.standardize_images=true --dataset.repo_id=test/recorded --dataset.root={known.root}",
+        f"--output_dir={tmp_path / 'scaled'}",
+    )
+    names = {FRONT: "observation.images.a", WRIST: "observation.images.b"}
+    renamed = {names.get(key, key): feature for key, feature in {**features(), **REWARDS}.items()}
+    dataset = record(tmp_path / "dataset", renamed, [("Wave", 6)])
+    rename_map = json.dumps({new: old for old, new in names.items()})
+    lerobot_wm_command(
+        f"train --policy.path={tmp_path / 'scaled' / 'pretrained_model'} {SHORT} {train_flags(dataset)}",
+        f"--rename_map={rename_map.replace(' ', '')} --output_dir={tmp_path / 'run'}",
+    )
+    before, after = (
+        load_file(path / "model.safetensors")["world_model.image_scaling.offset"]
+        for path in (tmp_path / "scaled" / "pretrained_model", tmp_path / "run" / CHECKPOINT)
+    )
+    assert torch.equal(before, after)
+
+
+def test_iql_goes_on_with_a_renamed_state(
+    checkpoints: dict[str, Path], tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    renamed = {("observation.joints" if k == "observation.state" else k): v for k, v in features().items()}
+    dataset = record(tmp_path / "dataset", {**renamed, **REWARDS}, [("Wave", 6)])
+    lerobot_wm_command(
+        f"train --policy.path={checkpoints['e2e_iql']} {SHORT} {train_flags(dataset)}",
+        f'--rename_map={{"observation.joints":"observation.state"}} --output_dir={tmp_path / "run"}',
+    )
+    assert load(tmp_path / "run" / CHECKPOINT).config.tasks == ["Reach", "Push", "Wave"]

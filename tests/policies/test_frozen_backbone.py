@@ -11,18 +11,21 @@ import torchvision
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.factory import get_policy_class
+from lerobot.policies import make_policy
+from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.pipeline.encode import encode_to_cache
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
 from lerobot_wm.policies.frozen_backbone.weights import load_backbone_weights
 from lerobot_wm.policies.frozen_encoder import load_encoder
 from lerobot_wm.policies.latent_setup import check_latents
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
+from tests.recording import FRONT, WRIST, camera, record, vector
 
 RESNET = "--policy.backbone=resnet18 --policy.backbone_image_size=32"
 FEATURES = 512
@@ -275,3 +278,40 @@ def test_features_of_several_cameras_stand_beside_each_other() -> None:
     assert features.shape == (1, 4, 2 * FEATURES)
     assert two.latent_dim == 2 * FEATURES
     torch.testing.assert_close(features, torch.cat([one.embed(left), one.embed(right)], dim=-1))
+
+
+def test_features_of_another_image_size_or_camera_are_not_taken_for_ones_own(
+    tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    """Equal weights encode otherwise: their latents lie in a folder of their own, and are refused."""
+    cameras = {
+        FRONT: camera(32, 32),
+        WRIST: camera(32, 32),
+        "action": vector(2),
+        "observation.state": vector(3),
+    }
+    dataset = record(tmp_path / "dataset", cameras, [("Reach", 6)])
+    meta = LeRobotDatasetMetadata("test/recorded", root=dataset.root)
+    roots = {}
+    for name, options in {
+        "small": f"--policy.backbone_image_size=32 --policy.image_key={FRONT}",
+        "large": f"--policy.backbone_image_size=64 --policy.image_key={FRONT}",
+        "wrist": f"--policy.backbone_image_size=32 --policy.image_key={WRIST}",
+    }.items():
+        lerobot_wm_command(
+            f"init --policy.type=frozen_backbone --policy.backbone=resnet18 {options} --policy.device=cpu --seed=3",
+            f"--dataset.repo_id=test/recorded --dataset.root={dataset.root} --output_dir={tmp_path / name}",
+        )
+        path = str(tmp_path / name / "pretrained_model")
+        roots[name] = encode_to_cache(path, "test/recorded", meta, "cpu")
+    assert len(set(roots.values())) == 3
+    latents = LeRobotDatasetMetadata("test/latents", root=roots["small"])
+    for name, message in (
+        ("large", "encoded by world model"),
+        ("wrist", f"images of {FRONT}, but .* sees {WRIST}"),
+    ):
+        config = make_policy_config(
+            "wm_bc", world_model_path=str(tmp_path / name / "pretrained_model"), device="cpu"
+        )
+        with pytest.raises(ValueError, match=message):
+            make_policy(config, ds_meta=latents)

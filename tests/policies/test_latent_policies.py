@@ -19,6 +19,7 @@ from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.pipeline.encode import encode_to_cache
 from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
@@ -403,3 +404,25 @@ def test_to_go_on_with_a_training_of_the_hub_needs_a_folder(
 ) -> None:
     with pytest.raises(ValueError, match=r"someone/wm_bc is no file or folder here.*--output_dir"):
         lerobot_wm_command("train --config_path=someone/wm_bc --resume=true")
+
+
+@pytest.mark.parametrize("policy_type", POLICY_TYPES)
+def test_a_policy_left_in_training_mode_acts_without_dropout(
+    policy_type: str, policy_paths: dict[str, Path], demos: LeRobotDataset
+) -> None:
+    policy = load(policy_paths, policy_type)
+    actions = []
+    for mode in (False, True):
+        policy.train(mode)
+        policy.reset()
+        actions.append(policy.select_action(frame(demos, 0)))
+    assert torch.equal(*actions)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"expectile": 1.7}, {"discount": 5.0}, {"target_rate": 0.0}, {"beta": -3.0}, {"sweep_betas": [-1.0]}],
+)
+def test_settings_that_invert_a_loss_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(wrong)).removeprefix('sweep_').rstrip('s')} is"):
+        WMIQLConfig(**wrong)

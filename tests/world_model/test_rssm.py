@@ -311,3 +311,27 @@ def test_standardized_images_are_scaled_where_they_enter_and_leave() -> None:
     assert torch.equal(model.decode(latents), mean[:, None, None].expand_as(images))
     error = model._image_loss(latents, images)  # of [0, 1], as without
     torch.testing.assert_close(error, (images - mean[:, None, None]).square().sum((2, 3, 4)))
+
+
+def test_what_precedes_an_episode_is_the_middle_of_the_actions_range() -> None:
+    """Whatever the units; whole episodes and single frames agree, and a state that is given reads its action."""
+    model = make_world_model(centred_start=True)
+    images, actions = two_lamps(1, 3, seed=7)
+    latents = model.filter(images, actions).latent
+    model.action_scaling.set_range(torch.tensor([90.0, 40.0]), torch.tensor([110.0, 60.0]))
+    raw = model.action_scaling.inverse(actions)
+    torch.testing.assert_close(model.filter(images, raw).latent, latents)
+    first = model.observe(images[:, :1], torch.zeros(1, 1, ACTION_DIM))
+    torch.testing.assert_close(first.latent, latents[:, :1])
+    rest = model.observe(images[:, 1:], raw[:, :-1], first.last())
+    torch.testing.assert_close(rest.latent, latents[:, 1:])
+
+
+@pytest.mark.parametrize(
+    "name", ["kl_scale", "free_nats", "reward_scale", "image_error_weight", "action_scale"]
+)
+def test_weights_below_zero_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} is -1"):
+        RSSMConfig(**{name: -1.0})
+    with pytest.raises(ValueError, match="min_std is 0"):
+        RSSMConfig(min_std=0.0)

@@ -1,6 +1,7 @@
 """A frozen image backbone that stands where a world model stands: its latent is the images' pooled features."""
 
 import difflib
+from typing import Any
 
 import torch
 import torchvision
@@ -37,6 +38,11 @@ class FrozenBackbone(LatentModel):
         self.model = make_model(name)
         self.requires_grad_(False).eval()
         self.latent_dim = self._feature_dim()  # of all cameras together
+
+    @property
+    def encoding_settings(self) -> dict[str, Any]:
+        """Networks that pool take any size of image, and see something else in each."""
+        return {"image_size": self.image_size}
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
         """Pooled features of K cameras' images (B, T, 3·K, H, W) in [0, 1], camera after camera: (B, T, F)."""

@@ -29,7 +29,8 @@ class WMRSSMConfig(LRDecayConfig, CompileConfig, WorldModelConfig, RewardConfig)
         window_length: Steps per training window T. A window starts at any frame from a zero state.
         lr: Learning rate of Adam.
         grad_clip_norm: Joint gradient norm above which gradients are scaled down.
-        dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in.
+        dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in, once: a
+            checkpoint keeps it.
     """
 
     predicts_images: ClassVar[bool] = True
