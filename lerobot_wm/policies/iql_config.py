@@ -24,7 +24,7 @@ class IQLConfig(RewardConfig, MultiTaskConfig):
         target_rate: Polyak rate of the target critics.
         done_key: The dataset's column that is true where an action ended the task, not where time ran out. None takes
             next.done or, in a dataset without it, next.success. LeRobot's own recorders set next.done at a time limit,
-            too: next.success for these.
+            too: next.success for these, or next.reward where there is none and the reward is 0/1.
         trained_betas: β of every actor, the main one first; filled when the policy is made.
     """
 

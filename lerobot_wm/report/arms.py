@@ -29,6 +29,12 @@ ARMS: dict[str, str] = {
 # Each of these is compared with every other arm.
 COMPARED_ARMS = ("wm_iql", "wm_bc")
 DENSE_SUFFIX = "_dense"
+_ON_WORLD_MODEL = "wm_"
+
+
+def on_one_world_model(arm: str, other: str) -> bool:
+    """Whether two arms stand on the same world model where their training seeds are the same."""
+    return arm.startswith(_ON_WORLD_MODEL) and other.startswith(_ON_WORLD_MODEL)
 
 
 def by_arm(records: Iterable[Record]) -> dict[str, list[Record]]:

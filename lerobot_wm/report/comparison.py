@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest
 
-from lerobot_wm.report.arms import COMPARED_ARMS, by_arm
+from lerobot_wm.report.arms import COMPARED_ARMS, by_arm, on_one_world_model
 from lerobot_wm.report.bootstrap import RNG_SEED, percentile_interval, resample
 from lerobot_wm.report.records import Record
+
+type Outcomes = dict[tuple[int | None, str, int], bool]  # (seed, task, variation) -> success
 
 SIGNIFICANCE = 0.05  # McNemar's test below which arms are called different, where it can be made
 
@@ -44,12 +46,18 @@ class Comparison:
 def compare(records: list[Record], others: list[Record]) -> Comparison | None:
     """Compare two arms over the rollouts (seed, task, variation) that both have; None where they share none.
 
+    An arm of one training seed is compared with every training of the other: picking the one of equal number would
+    compare with a lucky or an unlucky one. Not so arms on the same world model, which share the training of a seed.
+
     The difference is averaged over the shared seeds of a variation, the variations of a task and then the tasks. The
     interval is a percentile bootstrap that resamples variations within each task: a variation is drawn with all of
     its seeds, since rollouts on one variation are not independent. It covers the choice of variations; the training
     seeds are taken as they are.
     """
     ours, theirs = _outcomes(records), _outcomes(others)
+    if not on_one_world_model(records[0]["arm"], others[0]["arm"]):
+        ours = _for_every_seed(ours, theirs)
+        theirs = _for_every_seed(theirs, ours)
     shared = sorted(ours.keys() & theirs.keys(), key=str)
     if not shared:
         return None
@@ -90,8 +98,20 @@ def compare_arms(records: list[Record]) -> dict[str, list[Comparison]]:
     return {arm: results for arm, results in found.items() if results}
 
 
-def _outcomes(records: list[Record]) -> dict[tuple[int | None, str, int], bool]:
+def _outcomes(records: list[Record]) -> Outcomes:
     return {(record["seed"], record["task"], record["variation"]): record["success"] for record in records}
+
+
+def _for_every_seed(outcomes: Outcomes, others: Outcomes) -> Outcomes:
+    """The outcomes, of one training seed, under each of the others' seeds; of several, as they are."""
+    if len({seed for seed, _, _ in outcomes}) > 1:
+        return outcomes
+    seeds = {seed for seed, _, _ in others}
+    return {
+        (seed, task, variation): success
+        for (_, task, variation), success in outcomes.items()
+        for seed in seeds
+    }
 
 
 def _mcnemar(only_arm: int, only_other: int) -> float:

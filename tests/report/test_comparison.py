@@ -66,17 +66,32 @@ def test_seeds_of_one_variation_are_not_independent(make_records: Callable) -> N
 
 
 def test_only_shared_rollouts_count(make_records: Callable) -> None:
+    """Arms on the same world model share the training of a seed."""
     ours = make_records("wm_bc", TASKS, seed=0) + make_records("wm_bc", {"reach-v3": (0, 0)}, seed=1)
-    theirs = make_records("state_bc", {"reach-v3": (5, 20)}, seed=0)
+    theirs = make_records("wm_bc_single", {"reach-v3": (5, 20)}, seed=0)
     found = compare(ours, theirs)
     assert (found.n_pairs, found.difference) == (50, 0)
     assert found.p_value == 1, "one shared seed: the pairs are independent"
-    assert compare(ours, make_records("state_bc", TASKS, seed=7)) is None
+    assert compare(ours, make_records("wm_bc_single", TASKS, seed=7)) is None
+
+
+def test_one_training_is_compared_with_every_training_of_the_other(make_records: Callable) -> None:
+    """Of equal number or not: a lucky seed 0 is no better evidence than an unlucky seed 1."""
+    lucky, unlucky = (
+        make_records("wm_bc", {"reach-v3": outcomes}, seed) for seed, outcomes in ((0, (10, 40)), (1, (0, 0)))
+    )
+    for seed in (0, 7):
+        once = make_records("state_bc", {"reach-v3": (5, 20)}, seed)
+        found = compare(lucky + unlucky, once)
+        assert (found.n_pairs, found.difference, found.p_value) == (100, 0, None)
+        assert (found.only_arm, found.only_other) == (25, 25)
+        assert compare(once, lucky + unlucky).difference == 0
+    assert compare(lucky, once).p_value < 0.001, "one training of each: the pairs are independent"
 
 
 def test_world_model_arms_are_compared_with_every_other(make_records: Callable) -> None:
     records = [r for arm in ("mine", "proprio_bc", "wm_bc", "e2e_iql") for r in make_records(arm, TASKS)]
-    elsewhere = make_records("expert", TASKS, seed=3)
+    elsewhere = make_records("wm_bc_single", TASKS, seed=3)
     found = compare_arms(records + elsewhere)
     assert {arm: [c.other for c in results] for arm, results in found.items()} == {
         "wm_bc": ["e2e_iql", "proprio_bc", "mine"]
