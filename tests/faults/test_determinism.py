@@ -141,12 +141,15 @@ def check_rollouts(run: Actions, policy: Path, tmp_path: Path, sizes: Sequence[i
 
 
 def test_evaluation(
-    inputs: Inputs, tmp_path: Path, lerobot_wm_command: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    policy_paths: dict[str, Path],
+    tmp_path: Path,
+    lerobot_wm_command: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With noise on the actions, too: it is a rollout's own."""
     run = Actions(lerobot_wm_command, monkeypatch)
     flags = "--eval.n_episodes=5 --env.episode_length=15 --policy.action_noise=0.3"
-    check_rollouts(run, inputs.policy, tmp_path, (1, 5, 2), flags)
+    check_rollouts(run, policy_paths["wm_bc"], tmp_path, (1, 5, 2), flags)
 
 
 @pytest.mark.slow

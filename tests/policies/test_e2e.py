@@ -9,12 +9,14 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file, save_file
 
+from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
 from lerobot_wm.policies.e2e_bc.modeling_e2e_bc import E2EBCPolicy
 from lerobot_wm.policies.e2e_config import E2EConfig
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
 from lerobot_wm.policies.e2e_iql.modeling_e2e_iql import E2EIQLPolicy
 from lerobot_wm.policies.e2e_policy import E2EPolicy
+from lerobot_wm.policies.fits import check_environment_fits
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
 POLICY_TYPES = ("e2e_bc", "e2e_iql")
@@ -289,3 +291,11 @@ def test_a_policy_left_in_training_mode_acts_without_dropout_and_crops() -> None
     policy, batch = make_policy("e2e_bc", random_crop_pad=4), seen()
     expected = policy.eval().select_action(batch)
     assert torch.equal(policy.train().select_action(batch), expected)
+
+
+def test_a_policy_of_one_task_is_not_evaluated_on_another() -> None:
+    """Elsewhere it does its one task whatever it is told; metaworld_mt's tasks are known before work starts."""
+    config = make_config("e2e_bc", (3, 64, 64), tasks=["Reach a goal position"])
+    check_environment_fits(config, MetaworldMTEnvConfig(task="reach-v3"), {})
+    with pytest.raises(ValueError, match=r"Unknown task \['Open a drawer'\]"):
+        check_environment_fits(config, MetaworldMTEnvConfig(task="drawer-open-v3"), {})
