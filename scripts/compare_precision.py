@@ -32,9 +32,8 @@ def curves(folder: Path) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
     for training, names in MONITORED.items():
         log = [json.loads(line) for line in (folder / training / TRAIN_LOG_NAME).read_text().splitlines()]
-        by_step = list(
-            {line["step"]: line for line in log}.values()
-        )  # a training that went on logs a step twice
+        # A training that went on logs a step twice.
+        by_step = list({line["step"]: line for line in log}.values())
         edges = [round(i * len(by_step) / PARTS) for i in range(PARTS + 1)]
         parts = [by_step[low:high] for low, high in itertools.pairwise(edges)]
         found[training] = {

@@ -12,7 +12,7 @@ class LatentRecord:
     """Provenance of a latent dataset, kept in its `meta/latents.json`.
 
     Attributes:
-        world_model_fingerprint: `weights_fingerprint` of the encoding world model and its `encoding_settings`.
+        world_model_fingerprint: `encoder_fingerprint` of the encoding world model.
         source_repo_id: The dataset that was encoded.
         source_fingerprint: `dataset_fingerprint` of it.
         tasks: Its task strings, in order of task_index.

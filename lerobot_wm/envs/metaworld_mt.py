@@ -147,8 +147,8 @@ class MetaworldMTEnv(gym.Env):
     def close(self) -> None:
         """Free the simulator and its OpenGL memory; a later reset builds them again."""
         if self._sim is not None:
-            for camera in self._renderers:
-                Renderer.release(self._render_keys[camera])
+            for key in self._render_keys.values():
+                Renderer.release(key)
             self._renderers = {}
             self._sim = None
 

@@ -19,7 +19,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import OBS_LATENT, OBS_STATE
 from lerobot_wm.data.cache import cache_root
-from lerobot_wm.data.fingerprint import dataset_fingerprint, weights_fingerprint
+from lerobot_wm.data.fingerprint import dataset_fingerprint
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.hub.dataset_card import license_of, push_latents
@@ -31,7 +31,7 @@ from lerobot_wm.pipeline.quiet import quiet
 from lerobot_wm.pipeline.share import Share, refuse_difference
 from lerobot_wm.policies.fits import check_encoder_fits
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
-from lerobot_wm.policies.frozen_encoder import EncoderPolicy, load_encoder
+from lerobot_wm.policies.frozen_encoder import EncoderPolicy, encoder_fingerprint, load_encoder
 
 logger = logging.getLogger(__name__)
 
@@ -139,7 +139,7 @@ def _begin(
 def _record(policy: EncoderPolicy, source: LeRobotDataset, sample_seed: int | None) -> LatentRecord:
     features = dataset_to_policy_features(source.meta.features)
     return LatentRecord(
-        world_model_fingerprint=weights_fingerprint(policy.world_model, policy.world_model.encoding_settings),
+        world_model_fingerprint=encoder_fingerprint(policy.world_model),
         source_repo_id=source.repo_id,
         source_fingerprint=dataset_fingerprint(Path(source.root)),
         tasks=[str(task) for task in source.meta.tasks.index],
@@ -164,8 +164,8 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
     root = Path(meta.root)
     # Opened before it is hashed: of a dataset of the Hub only the metadata may be here yet.
     source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
-    settings = {**policy.world_model.encoding_settings, "cameras": policy.config.cameras}
-    name = f"{LATENTS_PREFIX}{weights_fingerprint(policy.world_model, settings)}-{dataset_fingerprint(root)}"
+    fingerprint = encoder_fingerprint(policy.world_model, cameras=policy.config.cameras)
+    name = f"{LATENTS_PREFIX}{fingerprint}-{dataset_fingerprint(root)}"
     output_root = cache_root(root) / name
     with sole_writer(output_root, wait=True):  # another training may be encoding it
         if output_root.is_dir():

@@ -1,13 +1,15 @@
 """What a latent policy holds and a dataset is encoded with: a world model, or an image backbone in its place."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lerobot.policies.factory import get_policy_class
 
+from lerobot_wm.data.fingerprint import weights_fingerprint
 from lerobot_wm.policies.checkpoint import read_config
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.world_model_config import WorldModelConfig
+from lerobot_wm.world_model.interface import LatentModel
 
 if TYPE_CHECKING:  # a latent policy's module imports this one
     from lerobot_wm.policies.latent_policy import LatentPolicy
@@ -38,3 +40,8 @@ def load_encoder(path: str) -> EncoderPolicy:
             "model or frozen_backbone, or of a policy on their latents such as wm_bc and wm_iql."
         )
     return get_policy_class(config.type).from_pretrained(name, config=config, revision=revision)
+
+
+def encoder_fingerprint(model: LatentModel, **further: Any) -> str:
+    """Hash of an encoder's weights and `encoding_settings`, and of what `further` decides its latents."""
+    return weights_fingerprint(model, {**model.encoding_settings, **further})

@@ -7,10 +7,9 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
-from lerobot_wm.data.fingerprint import weights_fingerprint
 from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
 from lerobot_wm.policies.features import stat
-from lerobot_wm.policies.frozen_encoder import load_encoder
+from lerobot_wm.policies.frozen_encoder import encoder_fingerprint, load_encoder
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.world_model.interface import LatentModel
 
@@ -38,9 +37,7 @@ def take_world_model(config: LatentPolicyConfig) -> LatentModel:
     )
     config.image_key = policy.config.image_key
     config.input_features |= {key: policy.config.input_features[key] for key in policy.config.cameras}
-    config.world_model_fingerprint = weights_fingerprint(
-        policy.world_model, policy.world_model.encoding_settings
-    )
+    config.world_model_fingerprint = encoder_fingerprint(policy.world_model)
     return policy.world_model
 
 

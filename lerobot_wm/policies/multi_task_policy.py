@@ -39,7 +39,7 @@ class MultiTaskPolicy(StrictPolicy):
         self.state_scaling = Affine(config.state_dim)
         self.action_scaling = Affine(config.action_dim)
         self._action_noise = ActionNoise(config.action_noise)
-        if dataset_stats is not None:  # a checkpoint's own values replace these when it is loaded
+        if dataset_stats is not None:  # made new: a checkpoint has its own
             self.state_scaling.set_standard(
                 stat(dataset_stats, OBS_STATE, "mean"), stat(dataset_stats, OBS_STATE, "std")
             )

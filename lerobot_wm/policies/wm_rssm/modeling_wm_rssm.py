@@ -48,7 +48,7 @@ class WMRSSMPolicy(WorldModelPolicy):
         if config.compile_model and dataset_meta is not None:
             rssm = self.world_model.rssm
             rssm.observe = compiled(rssm.observe)  # type: ignore[method-assign]
-        if dataset_stats is not None:  # a checkpoint's own values replace these when it is loaded
+        if dataset_stats is not None:  # made new: a checkpoint has its own
             self.world_model.action_scaling.set_range(
                 stat(dataset_stats, ACTION, "min"), stat(dataset_stats, ACTION, "max")
             )
