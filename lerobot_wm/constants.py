@@ -45,11 +45,13 @@ TASK_SETS: dict[str, tuple[str, ...]] = {"mt6": MT6, "mt10": MT10}
 ENV_TYPE = "metaworld_mt"
 NUM_VARIATIONS = 50
 NUM_SEEN_VARIATIONS = 10  # variations 0-9 are collected on, 10-49 are never seen in training
-# Sets of fixed variations, named by the seed given to metaworld.MT1. What is reported is measured on the first;
-# the second, other positions of the same objects, is for choosing settings and for probes, and is never reported.
+# Sets of fixed variations, named by the seed given to metaworld.MT1. The table is measured on the first; the second,
+# other positions of the same objects, is for choosing settings and for probes; the third is for settings that are
+# final, once, when the table's positions have been looked at before.
 REPORTED_VARIATION_SET = 42
 SELECTION_VARIATION_SET = 43
-VARIATION_SETS = (REPORTED_VARIATION_SET, SELECTION_VARIATION_SET)
+CONFIRMATION_VARIATION_SET = 44
+VARIATION_SETS = (REPORTED_VARIATION_SET, SELECTION_VARIATION_SET, CONFIRMATION_VARIATION_SET)
 MAX_EPISODE_STEPS = 500
 FPS = 80  # one environment step is 0.0125 s of simulated time
 ACTION_DIM = 4  # x, y, z, gripper, each in [-1, 1]

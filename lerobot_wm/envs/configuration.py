@@ -36,7 +36,8 @@ class MetaworldMTEnvConfig(EnvConfig):
     Args:
         task: a task, a set (mt6, mt10, mt50) or a comma-separated list.
         split: "all" (variations 0-49), "seen" (0-9) or "unseen" (10-49).
-        variation_set: 42, on which results are reported, or 43, other positions for choosing settings and for probes.
+        variation_set: 42, on which results are reported, 43, other positions for choosing settings and for probes, or
+            44, others again for confirming a final choice.
         environment_state: add the full state, `observation.environment_state` (39,), to the observation.
         image_size: height and width of the image in pixels.
         camera_name: one of the model's cameras, or several separated by commas: corner2,topview.

@@ -40,7 +40,8 @@ class MetaworldMTEnv(gym.Env):
     Args:
         task: a Meta-World v3 task, such as "reach-v3".
         split: "all", "seen" (variations 0-9) or "unseen" (10-49).
-        variation_set: 42, on which results are reported, or 43, for choosing settings and for probes.
+        variation_set: 42, on which results are reported, 43, for choosing settings and for probes, or 44, for
+            confirming a final choice.
         environment_state: add the full state to the observation, for policies that are given the truth.
         image_size: height and width of the image in pixels.
         camera_name: one of the model's cameras, or several separated by commas; "corner2" is moved to where

@@ -30,7 +30,7 @@ class Simulation:
 
     Args:
         task: a Meta-World v3 task, such as "reach-v3".
-        variation_set: 42 or 43, see envs/variations.py.
+        variation_set: 42, 43 or 44, see envs/variations.py.
     """
 
     def __init__(self, task: str, variation_set: int = REPORTED_VARIATION_SET) -> None:

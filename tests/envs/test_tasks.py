@@ -58,10 +58,10 @@ def test_variations_are_metaworlds_own(variation_set: int) -> None:
 def test_variations_are_complete_and_distinct() -> None:
     """Within a set and between the sets: what settings are chosen on is not what is reported."""
     sets = json.loads(variations.VARIATIONS_PATH.read_bytes())["sets"]
-    assert set(sets) == {"42", "43"}
+    assert set(sets) == {"42", "43", "44"}
     for task in all_tasks():
-        assert len({tuple(vector) for data in sets.values() for vector in data[task]}) == 100
-    assert sets["42"].keys() == sets["43"].keys() == set(all_tasks())
+        assert len({tuple(vector) for data in sets.values() for vector in data[task]}) == 150
+    assert all(data.keys() == set(all_tasks()) for data in sets.values())
 
 
 def test_reported_variations_never_change() -> None:
@@ -92,7 +92,7 @@ def test_changed_variations_are_refused(tmp_path: Path, monkeypatch: pytest.Monk
     [
         ("task", "reach", "reach-v3"),
         ("split", "train", "all, seen, unseen"),
-        ("variation_set", 44, "one of 42, 43"),
+        ("variation_set", 45, "one of 42, 43, 44"),
         ("camera_name", "corner4", "did you mean corner"),
         ("camera_name", "corner2,", "unknown camera ''"),
         ("camera_name", "corner2, corner2", "each camera once"),
