@@ -1,5 +1,7 @@
 """The success rates that README.md shows are those of the committed rollouts, its speeds those measured."""
 
+import json
+import runpy
 from pathlib import Path
 
 import pytest
@@ -70,3 +72,13 @@ def test_readme_shows_the_committed_measurements() -> None:
     shown = [tuple(cells(line)[1:]) for line in section.splitlines() if line.startswith("|")][2:]
     assert len(shown) > 10
     assert set(shown) <= measured
+
+
+def test_precision_page_shows_the_committed_trainings_and_rollouts() -> None:
+    script = runpy.run_path(str(ROOT / "scripts" / "compare_precision.py"))
+    folder = ROOT / "results" / "precision"
+    document = json.loads((folder / "precision.json").read_text())
+    half = [r for r in read_records([ROOT / "results" / "cpu" / "records.jsonl"]) if r["seed"] == 0]
+    assert script["success"](half, read_records([folder / "records_float32.jsonl"])) == document["success"]
+    page = (folder / "README.md").read_text()
+    assert all(table in page for table in script["tables"](document).split("\n\n"))
