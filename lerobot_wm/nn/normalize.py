@@ -9,7 +9,8 @@ _EPS = 1e-6
 class Affine(nn.Module):
     """x -> (x - offset) / scale per feature, and back.
 
-    Entries whose scale is (nearly) zero are constant in the data: they are only shifted, never blown up.
+    Entries whose scale is (nearly) zero are constant in the data: they are only shifted, never blown up, and the way
+    back gives the constant, whatever is asked for. (Checkpoints before 0.2 have a scale of 1 there.)
     """
 
     offset: Tensor
@@ -35,11 +36,11 @@ class Affine(nn.Module):
                 f"{tuple(self.offset.shape)}: recompute the statistics or use the dataset the model was made for."
             )
         self.offset.copy_(offset)
-        self.scale.copy_(torch.where(scale > _EPS, scale, torch.ones_like(scale)))
+        self.scale.copy_(torch.where(scale > _EPS, scale, torch.zeros_like(scale)))
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise (..., dim)."""
-        return (x - self.offset) / self.scale
+        return (x - self.offset) / torch.where(self.scale > 0, self.scale, 1.0)
 
     def inverse(self, x: Tensor) -> Tensor:
         """Undo `forward` on (..., dim)."""

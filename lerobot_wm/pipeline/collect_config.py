@@ -29,7 +29,7 @@ class CollectConfig:
     episodes_per_task: int = 130
     # Variations to collect on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
     variations: str = "0-9"
-    # Set of variations: 42, on which policies are trained and reported, or 43, for choosing settings and for probes.
+    # Set of variations: 42, for training and reported results, 43, for choosing settings and for probes, or 44.
     variation_set: int = REPORTED_VARIATION_SET
     # Standard deviation of the Gaussian noise added to the expert's clipped actions.
     noise: float = 0.3

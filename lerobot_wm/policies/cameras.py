@@ -96,7 +96,7 @@ def check_observation(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> No
     """Check what a policy is shown at test time: each camera (B, C, H, W), and `observation.state` (B, P).
 
     Raises:
-        ValueError: A camera is missing or has another size than in training, or the state has another size.
+        ValueError: A camera or the state is missing or has another size than in training.
     """
     _check_there(config, batch)
     for key in config.cameras:
@@ -108,7 +108,21 @@ def check_observation(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> No
                 f"to a height of {expected[1]} and a width of {expected[2]} (in --robot.cameras of a robot, by "
                 f"--env.image_size={expected[1]} for metaworld_mt)."
             )
+    check_state(config, batch)
+
+
+def check_state(config: PreTrainedConfig, batch: Mapping[str, Any]) -> None:
+    """Check `observation.state` (B, P) of an observation at test time, where the policy was trained with it.
+
+    Raises:
+        ValueError: It is missing or has another size than in training.
+    """
     trained_on = config.input_features.get(OBS_STATE)
+    if trained_on is not None and OBS_STATE not in batch:
+        raise ValueError(
+            f"The observation has no '{OBS_STATE}', this policy was trained on {trained_on.shape[0]} numbers: have the "
+            "robot or environment give its state (--env.obs_type=pixels_agent_pos of LeRobot's environments)."
+        )
     if trained_on is not None and batch[OBS_STATE].shape[1:] != tuple(trained_on.shape):
         raise ValueError(
             f"'{OBS_STATE}' has {batch[OBS_STATE].shape[-1]} numbers, this policy was trained on "

@@ -35,11 +35,18 @@ def feature_dim(features: dict[str, PolicyFeature], key: str, where: str) -> int
     """Size of the vector feature `key`.
 
     Raises:
-        ValueError: The feature is missing; names what is there.
+        ValueError: The feature is missing; names what is there. Or it is one number: LeRobot stores it without its
+            axis, and the batch it makes of B of them, (1, B), cannot be told from one vector of B numbers.
     """
     if key not in features:
         raise ValueError(f"{where} has no '{key}'; it has {sorted(features)}.")
-    return features[key].shape[0]
+    size = features[key].shape[0]
+    if size == 1:
+        raise ValueError(
+            f"'{key}' has the shape (1,); expected two numbers or more, since LeRobot's batches lose the axis of a "
+            "single one. Record it with a second number, which may be constant."
+        )
+    return size
 
 
 def image_keys(features: dict[str, PolicyFeature]) -> list[str]:

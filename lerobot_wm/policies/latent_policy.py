@@ -10,7 +10,7 @@ from torchvision.utils import make_grid
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.nn.normalize import Affine
-from lerobot_wm.policies.cameras import camera_images, check_observation, side_by_side
+from lerobot_wm.policies.cameras import camera_images, check_observation, check_state, side_by_side
 from lerobot_wm.policies.features import stat
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.latent_setup import check_latents, deployed_features, take_world_model
@@ -141,11 +141,12 @@ class LatentPolicy(MultiTaskPolicy):
             Actions in the dataset's units, (B, A).
 
         Raises:
-            ValueError: A camera is missing or has another size than in training, the task is unknown, or the full
+            ValueError: A camera is missing or has another size than in training, the task is unknown, or a
                 state is missing.
         """
         if self.training:  # no dropout, as LeRobot's policies act
             self.eval()
+        check_state(self.config, batch)
         state = batch[OBS_STATE]
         latent = self._filter(batch) if self.config.use_latent else None
         env_state = self._env_state(batch) if self.config.use_environment_state else None

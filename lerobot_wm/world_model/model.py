@@ -147,7 +147,8 @@ class WorldModel(LatentModel):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The training loss on windows: reconstruction, reward and KL with free nats.
 
-        A window starts from the zero state and a zero previous action, wherever in its episode it lies. The reward
+        A window starts from the zero state and, for the previous action, the middle of their range (zeros
+        without `config.centred_start`), wherever in its episode it lies. The reward
         loss is averaged over all T frames, though the first has none: it weighs (T-1)/T of `reward_scale`.
 
         Args:

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.factory import make_dataset
@@ -255,3 +256,23 @@ def test_released_checkpoints_load_and_act_as_they_did(policy_type: str, tmp_pat
 
 def test_every_type_has_a_released_checkpoint() -> None:
     assert set(RELEASED) == set(TYPES)
+
+
+@pytest.mark.parametrize("policy_type", TRAINED)
+def test_an_action_of_one_number_is_refused(policy_type: str, make: Make) -> None:
+    """LeRobot hands over B of them as (1, B), on which behaviour cloning would learn the batch's mean."""
+    config = deepcopy(make(policy_type)[2].config)
+    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (1,))}
+    with pytest.raises(ValueError, match=r"'action' has the shape \(1,\); expected two numbers or more"):
+        get_policy_class(policy_type)(config)
+
+
+@pytest.mark.parametrize("policy_type", ACTING)
+def test_an_observation_without_its_state_is_refused(
+    policy_type: str, dataset: LeRobotDataset, make: Make
+) -> None:
+    policy = make(policy_type)[2]
+    observation = shown(dataset)
+    del observation["observation.state"]
+    with pytest.raises(ValueError, match=r"has no 'observation.state', this policy was trained on 5 numbers"):
+        policy.select_action(observation)
