@@ -193,6 +193,20 @@ class CameraCache:
         return open_memmap(path, mode="r+")
 
 
+def check_no_depth(dataset: LeRobotDataset, keys: Iterable[str]) -> None:
+    """Refuse cameras whose pixels are distances.
+
+    Raises:
+        ValueError: Some of the keys are depth cameras.
+    """
+    depth = [key for key in keys if key in dataset.meta.depth_keys]
+    if depth:
+        raise ValueError(
+            f"{dataset.repo_id} has depth cameras, {', '.join(depth)}; models here see colours, 0 to 255. Choose the "
+            "others with --policy.image_key, or remove these with lerobot-edit-dataset."
+        )
+
+
 def camera_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int] | None = None) -> Tensor:
     """A camera's decoded frames, (N, H, W, C) uint8 by absolute index, memory-mapped.
 
@@ -202,7 +216,11 @@ def camera_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int] | Non
         dataset: The dataset.
         key: The camera.
         size: (H, W) that frames are resized to, once; None leaves them as they are in the dataset.
+
+    Raises:
+        ValueError: It is a depth camera.
     """
+    check_no_depth(dataset, [key])
     folder = cache_root(Path(dataset.root)) / f"frames-{dataset_fingerprint(Path(dataset.root))}"
     folder.mkdir(exist_ok=True)
     cache = CameraCache(dataset, key, folder, size)

@@ -8,7 +8,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
-from lerobot_wm.data.cache import camera_frames
+from lerobot_wm.data.cache import camera_frames, check_no_depth
 from lerobot_wm.data.check_info import TEXT_DTYPES
 from lerobot_wm.data.finite import check_finite_columns
 from lerobot_wm.data.tables import column_tensor
@@ -48,12 +48,7 @@ class RamDataset:
             )
         self.device = device
         meta = dataset.meta
-        depth = [key for key in meta.depth_keys if cameras is None or key in cameras]
-        if depth:
-            raise ValueError(
-                f"{dataset.repo_id} has depth cameras, {', '.join(depth)}: frames are served as uint8, which cannot "
-                "hold them. Train with lerobot-train, or remove them with lerobot-edit-dataset."
-            )
+        check_no_depth(dataset, meta.camera_keys if cameras is None else cameras)
         self._tasks = [str(task) for task in meta.tasks.index]
         self._deltas: dict[str, list[int]] = dataset.reader.delta_indices or {}
         kinds = {key: feature["dtype"] for key, feature in meta.features.items()}

@@ -135,8 +135,14 @@ def test_depth_cameras_are_refused(tmp_path: Path) -> None:
     dataset.save_episode()
     dataset.finalize()
     dataset = LeRobotDataset("test/depth", root=tmp_path / "depth")
-    with pytest.raises(ValueError, match=r"depth cameras, observation\.images\.depth: .*lerobot-train"):
-        RamDataset(dataset, CPU)
+    for read in (
+        lambda: RamDataset(dataset, CPU),
+        lambda: camera_frames(dataset, "observation.images.depth"),
+    ):
+        with pytest.raises(
+            ValueError, match=r"depth cameras, observation\.images\.depth; .*--policy\.image_key"
+        ):
+            read()
 
 
 def test_a_window_never_crosses_an_episode(demos_root: Path) -> None:
