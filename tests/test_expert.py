@@ -62,7 +62,7 @@ def test_the_second_set_has_its_own_rollouts(
     ("flags", "message"),
     [
         ("--tasks=reach", "did you mean reach-v3"),
-        ("--variation_set=44", "one of 42, 43"),
+        ("--variation_set=45", "one of 42, 43, 44"),
         ("--variations=50", "0 to 49"),
         ("--num_workers=0", "at least 1"),
     ],
