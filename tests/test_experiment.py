@@ -58,7 +58,7 @@ def run(folder: Path, arms: list[tuple[str, int]]) -> tuple[list[Stage], str]:
 
 
 def recorded(folder: Path) -> list[tuple[str, int | None]]:
-    records = read_records([folder / "outputs" / "records.jsonl"])
+    records = read_records([folder / "outputs" / "own_records.jsonl"])
     return sorted({(record["arm"], record["seed"]) for record in records})
 
 
@@ -77,7 +77,7 @@ def test_finished_arms_are_not_run_again_and_new_ones_are_added(tmp_path: Path) 
 
 def test_rollouts_that_a_killed_run_left_behind_are_recorded(tmp_path: Path) -> None:
     run(tmp_path, [("wm_bc", 0)])
-    (tmp_path / "outputs" / "records.jsonl").unlink()
+    (tmp_path / "outputs" / "own_records.jsonl").unlink()
     _, printed = run(tmp_path, [("wm_bc", 0)])
     assert printed == ""
     assert recorded(tmp_path) == [("wm_bc", 0)]
@@ -88,7 +88,7 @@ def committed(tmp_path: Path) -> Path:
     """A folder where wm_bc's records are committed and everything else of it is gone."""
     run(tmp_path, [("wm_bc", 0)])
     (tmp_path / "results").mkdir()
-    (tmp_path / "outputs" / "records.jsonl").rename(tmp_path / "results" / "records.jsonl")
+    (tmp_path / "outputs" / "own_records.jsonl").rename(tmp_path / "results" / "records.jsonl")
     (tmp_path / "outputs" / "wm_bc_0" / "done").unlink()
     return tmp_path
 

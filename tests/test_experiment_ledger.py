@@ -52,18 +52,23 @@ def test_added_once_and_found_again(tmp_path: Path, preset: Preset) -> None:
     files = [write(tmp_path / "a.jsonl", records[:3]), write(tmp_path / "b.jsonl", records[3:])]
     for _ in range(2):
         ledger.add("wm_bc", 0, files)
+    ledger.write()
     assert read_records([path]) == records
     again = Ledger(path, committed, preset)
     assert ("wm_bc", 0) in again
     assert ("wm_bc", 1) not in again
     again.add("wm_bc", 1, [write(tmp_path / "c.jsonl", rollouts("wm_bc", 1, preset))])
+    again.write()
     assert len(read_records([path])) == 2 * len(records)  # read_records refuses a rollout that is there twice
     assert not list(tmp_path.glob("*.part"))
 
 
 def test_committed_records_count_and_win(tmp_path: Path, preset: Preset) -> None:
-    path = write(tmp_path / "records.jsonl", rollouts("wm_bc", 0, preset) + rollouts("wm_iql", 0, preset))
-    committed = write(tmp_path / "results.jsonl", rollouts("wm_bc", 0, preset, success=False))
+    path, committed = tmp_path / "records.jsonl", tmp_path / "results.jsonl"
+    before = Ledger(path, committed, preset)
+    for arm in ("wm_bc", "wm_iql"):
+        before.add(arm, 0, [write(tmp_path / f"{arm}.jsonl", rollouts(arm, 0, preset))])
+    write(committed, rollouts("wm_bc", 0, preset, success=False))
     ledger = Ledger(path, committed, preset)
     assert ("wm_bc", 0) in ledger
     assert ("wm_iql", 0) in ledger
@@ -73,11 +78,24 @@ def test_committed_records_count_and_win(tmp_path: Path, preset: Preset) -> None
     assert not any(record["success"] for record in kept if record["arm"] == "wm_bc")
 
 
+def test_committed_records_do_not_count_where_others_are_asked_for(tmp_path: Path, preset: Preset) -> None:
+    """The folder's own rollouts do: all anew means what was committed, not what this folder has made."""
+    path, committed = tmp_path / "records.jsonl", tmp_path / "results.jsonl"
+    write(committed, rollouts("wm_bc", 0, preset))
+    ledger = Ledger(path, committed, preset)
+    ledger.add("wm_iql", 0, [write(tmp_path / "a.jsonl", rollouts("wm_iql", 0, preset))])
+    ledger.write()
+    anew = Ledger(path, tmp_path / "none.jsonl", preset)
+    assert ("wm_bc", 0) not in anew
+    assert ("wm_iql", 0) in anew
+
+
 def test_an_incomplete_run_does_not_count(tmp_path: Path, preset: Preset) -> None:
     committed = write(tmp_path / "results.jsonl", rollouts("wm_bc", 0, preset)[:-1])
     ledger = Ledger(tmp_path / "records.jsonl", committed, preset)
     assert ("wm_bc", 0) not in ledger
     ledger.add("wm_bc", 0, [write(tmp_path / "a.jsonl", rollouts("wm_bc", 0, preset))])
+    ledger.write()
     assert len(read_records([tmp_path / "records.jsonl"])) == 6
 
 
@@ -92,9 +110,11 @@ def test_other_rollouts_than_expected_are_refused(tmp_path: Path, preset: Preset
 
 def test_records_of_another_preset_are_refused(tmp_path: Path, preset: Preset) -> None:
     records = [record | {"preset": "cpu"} for record in rollouts("wm_bc", 0, preset)]
-    file, none = write(tmp_path / "results.jsonl", records), tmp_path / "none.jsonl"
-    for path, committed in ((file, none), (none, file)):
-        with pytest.raises(ValueError, match=r"results\.jsonl: rollouts of the preset cpu, .* for 'smoke'"):
+    file, none = write(tmp_path / "own_records.jsonl", records), tmp_path / "none.jsonl"
+    for path, committed in ((tmp_path / "records.jsonl", none), (none, file)):
+        with pytest.raises(
+            ValueError, match=r"own_records\.jsonl: rollouts of the preset cpu, .* for 'smoke'"
+        ):
             Ledger(path, committed, preset)
     with pytest.raises(ValueError, match="rollouts of the preset cpu"):
         Ledger(none, none, preset).add("wm_bc", 0, [file])

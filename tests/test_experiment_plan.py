@@ -98,6 +98,10 @@ def test_every_command_line_is_understood(tmp_path: Path) -> None:
         finish(stage)  # now the report shows everything it can
     report = parse(report_command(at, runs, tmp_path / "records.jsonl", tmp_path / "report"))
     assert "eval_expert" not in report.videos  # it has none
+    assert report.world_model_path is not None
+    stages["dataset"].artefact.unlink()
+    report = parse(report_command(at, runs, tmp_path / "records.jsonl", tmp_path / "report"))
+    assert (report.world_model_path, report.dataset.repo_id) == (None, None), "the demonstrations are gone"
 
 
 @pytest.mark.parametrize("name", ["cpu", "paper"])

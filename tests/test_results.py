@@ -4,9 +4,11 @@ import json
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lerobot_wm.envs.tasks import resolve_tasks
+from lerobot_wm.report.build import ReportConfig, report
 from lerobot_wm.report.records import Record, read_records
 from lerobot_wm.report.statistics import in_split, success_rate
 
@@ -39,6 +41,51 @@ def test_readme_shows_the_committed_rollouts(preset: str, name: str) -> None:
     assert table
     for arm, cells in table.items():
         assert cells == expected([record for record in records if record["arm"] == arm]), arm
+
+
+@pytest.mark.parametrize(
+    ("preset", "records", "tables"),
+    [
+        ("cpu", "records.jsonl", "success.md"),
+        ("best", "records.jsonl", "success.md"),
+        ("best", "records_set44.jsonl", "success_set44.md"),
+        ("mt10", "records.jsonl", "success.md"),
+    ],
+)
+def test_the_tables_are_those_of_the_committed_rollouts(
+    preset: str, records: str, tables: str, tmp_path: Path
+) -> None:
+    """To mend: `lerobot-wm report --records=results/PRESET/RECORDS`, and commit its success.md."""
+    folder = ROOT / "results" / preset
+    report(ReportConfig(records=str(folder / records), output_dir=tmp_path))
+    assert (folder / tables).read_text() == (tmp_path / "success.md").read_text()
+
+
+@pytest.mark.parametrize("preset", ["cpu", "best"])
+def test_the_pages_show_the_measured_quality(preset: str) -> None:
+    """Means over tasks, without the row of all tasks together."""
+    names = {
+        "closed loop": "reconstruction (closed loop)",
+        "open loop": "imagination (open loop)",
+        "shuffled actions": "imagination with shuffled actions",
+        "copy last frame": "last image copied",
+        "mean image": "mean image",
+    }
+    folder = ROOT / "results" / preset
+    measured = json.loads((folder / "quality.json").read_text())["open_loop"]
+    page = (folder / "README.md").read_text().split("| PSNR in dB, mean of six tasks")[1].split("\n\n")[0]
+    shown = {}
+    for line in page.splitlines()[2:]:
+        name, *cells = (cell.strip() for cell in line.split("|")[1:-1])
+        shown[name] = cells
+    expected = {}
+    for prediction, name in names.items():
+        by_horizon: dict[int, list[float]] = {}
+        for entry in measured:
+            if entry["prediction"] == prediction and entry["task"] != "all tasks":
+                by_horizon.setdefault(entry["horizon"], []).append(entry["psnr"])
+        expected[name] = [f"{np.mean(psnr):.1f}" for psnr in by_horizon.values()]
+    assert shown == expected
 
 
 def test_the_rates_of_mt10_are_those_of_the_committed_rollouts() -> None:

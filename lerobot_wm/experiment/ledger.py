@@ -1,4 +1,4 @@
-"""The records of an experiment: every finished arm and seed once, in one file that is never half-written."""
+"""The records of an experiment: every finished arm and seed once, in files that are never half-written."""
 
 import os
 from pathlib import Path
@@ -6,15 +6,17 @@ from pathlib import Path
 from lerobot_wm.experiment.preset import Preset
 from lerobot_wm.report.records import Record, read_records, record_line
 
+type Runs = dict[tuple[str, int | None], list[Record]]  # by (arm, seed)
+
 
 class Ledger:
-    """`records.jsonl` of an experiment, by (arm, seed).
+    """The records of an experiment by (arm, seed): committed ones, and those that its output folder rolled out.
 
-    An arm and seed is in it when each of its rollouts is, one on every variation of every task. It starts from
-    the committed results and what earlier runs have written; committed records win.
+    An arm and seed is in it when each of its rollouts is, one on every variation of every task. Committed records win.
+    The two are kept apart, so that committed records do not count where others are asked for later.
 
     Args:
-        path: The file.
+        path: Where all of them are written together; the folder's own are beside it, in a file named own_....
         committed: Records that count although nothing else of their runs is left.
         preset: Says which rollouts an arm and seed has.
 
@@ -24,23 +26,20 @@ class Ledger:
 
     def __init__(self, path: Path, committed: Path, preset: Preset) -> None:
         self.path = path
+        self._own_path = path.with_name(f"own_{path.name}")
         self._preset = preset.name
         self._rollouts = {(task, k) for task in preset.task_names for k in preset.variations}
-        self._runs: dict[tuple[str, int | None], list[Record]] = {}
-        for file in (path, committed):
-            if file.is_file() and file.stat().st_size:
-                self._runs |= {
-                    run: rows for run, rows in by_run(self._read([file])).items() if self._whole(rows)
-                }
+        self._committed = self._whole_runs(committed)
+        self._own = self._whole_runs(self._own_path)
 
     def __contains__(self, run: tuple[str, int]) -> bool:
         """Whether an arm and seed is finished."""
-        return run in self._runs
+        return run in self._committed or run in self._own
 
     @property
     def empty(self) -> bool:
         """Whether nothing is finished."""
-        return not self._runs
+        return not self._committed and not self._own
 
     def add(self, arm: str, seed: int, files: list[Path]) -> None:
         """Take the rollouts of a finished arm and seed; those it has already are left as they are.
@@ -57,15 +56,17 @@ class Ledger:
                 f"{', '.join(map(str, files))}: {len(records)} rollouts of (arm, seed) {found}; expected the "
                 f"{len(self._rollouts)} of ('{arm}', {seed}). Remove these folders to roll out again."
             )
-        self._runs[arm, seed] = records
-        self.write()
+        self._own[arm, seed] = records
+        _write(self._own_path, self._own)
 
     def write(self) -> None:
-        """Replace the file at once."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = self.path.with_name(f"{self.path.name}.part")
-        unfinished.write_text("".join(record_line(record) for rows in self._runs.values() for record in rows))
-        os.replace(unfinished, self.path)
+        """Write all records to the one file."""
+        _write(self.path, self._own | self._committed)
+
+    def _whole_runs(self, file: Path) -> Runs:
+        if not file.is_file() or not file.stat().st_size:
+            return {}
+        return {run: rows for run, rows in by_run(self._read([file])).items() if self._whole(rows)}
 
     def _read(self, files: list[Path]) -> list[Record]:
         records = read_records(files)
@@ -81,9 +82,17 @@ class Ledger:
         return {(record["task"], record["variation"]) for record in records} == self._rollouts
 
 
-def by_run(records: list[Record]) -> dict[tuple[str, int | None], list[Record]]:
+def by_run(records: list[Record]) -> Runs:
     """Records by (arm, seed), in order."""
-    runs: dict[tuple[str, int | None], list[Record]] = {}
+    runs: Runs = {}
     for record in records:
         runs.setdefault((record["arm"], record["seed"]), []).append(record)
     return runs
+
+
+def _write(path: Path, runs: Runs) -> None:
+    """Replace the file at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.name}.part")
+    unfinished.write_text("".join(record_line(record) for rows in runs.values() for record in rows))
+    os.replace(unfinished, path)

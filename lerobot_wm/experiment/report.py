@@ -21,7 +21,7 @@ def report_command(plan: Plan, runs: list[tuple[Arm, int]], records: Path, folde
     evaluations = [stage for run in trained for stage in plan.evaluations(*run)]
     trainings = [stage for arm, seed in trained if not arm.individual for stage in plan.policies(arm, seed)]
     seed = runs[0][1]
-    world_model, quality = plan.world_model(seed), plan.quality(seed)
+    world_model, quality, dataset = plan.world_model(seed), plan.quality(seed), plan.demonstrations.sparse()
     flags: dict[str, object] = {
         "records": records,
         "output_dir": folder,
@@ -31,8 +31,9 @@ def report_command(plan: Plan, runs: list[tuple[Arm, int]], records: Path, folde
         folders = dict.fromkeys(str(stage.folder) for stage in stages if stage.finished)
         if folders:
             flags[flag] = ",".join(folders)
-    if world_model.made_by.finished:
-        flags |= {"world_model_path": world_model.path, **plan.demonstrations.sparse().flags()}
+    # Once all is trained the demonstrations may have been removed: the world model is shown on them.
+    if world_model.made_by.finished and dataset.made_by.finished:
+        flags |= {"world_model_path": world_model.path, **dataset.flags()}
     if quality.finished:
         flags["quality"] = quality.artefact
     return lerobot_wm("report", flags)

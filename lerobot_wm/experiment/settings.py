@@ -34,7 +34,8 @@ def check_settings(preset: Preset, output_dir: Path) -> None:
         if changed:
             raise ValueError(
                 f"{output_dir} was made with other settings: {', '.join(changed)} of {preset.folder / file}. Set them "
-                f"back or give another --output_dir; or remove there what depends on them, and {path}."
+                f"back or give another --output_dir; or remove there what depends on them, the own_records*.jsonl "
+                f"among it, and {path}."
             )
     output_dir.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(known | now, indent=1) + "\n")

@@ -29,12 +29,18 @@ ARMS: dict[str, str] = {
 # Each of these is compared with every other arm.
 COMPARED_ARMS = ("wm_iql", "wm_bc")
 DENSE_SUFFIX = "_dense"
-_ON_WORLD_MODEL = "wm_"
-
-
-def on_one_world_model(arm: str, other: str) -> bool:
-    """Whether two arms stand on the same world model where their training seeds are the same."""
-    return arm.startswith(_ON_WORLD_MODEL) and other.startswith(_ON_WORLD_MODEL)
+# Arms of one training seed stand on one world model. Not so wm_proprio_bc, which has its own.
+SHARING_WORLD_MODEL = frozenset(
+    {
+        "wm_iql",
+        "wm_bc",
+        "wm_iql_single",
+        "wm_bc_single",
+        "wm_iql_beta0",
+        "wm_iql_beta3",
+        "wm_iql_beta10",
+    }
+)
 
 
 def by_arm(records: Iterable[Record]) -> dict[str, list[Record]]:

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest
 
-from lerobot_wm.report.arms import COMPARED_ARMS, by_arm, on_one_world_model
+from lerobot_wm.report.arms import COMPARED_ARMS, SHARING_WORLD_MODEL, by_arm
 from lerobot_wm.report.bootstrap import RNG_SEED, percentile_interval, resample
 from lerobot_wm.report.records import Record
-
-type Outcomes = dict[tuple[int | None, str, int], bool]  # (seed, task, variation) -> success
 
 SIGNIFICANCE = 0.05  # McNemar's test below which arms are called different, where it can be made
 
@@ -19,7 +17,7 @@ class Comparison:
     """Success of `arm` minus that of `other`, in percentage points, over `n_pairs` rollouts of each.
 
     `only_arm` and `only_other` count the pairs where just that one succeeded. `p_value` is that of the exact
-    McNemar test, None where the pairs come from several training seeds and are not independent.
+    McNemar test, None where several trainings of an arm make the pairs of a variation dependent.
     """
 
     arm: str
@@ -44,45 +42,51 @@ class Comparison:
 
 
 def compare(records: list[Record], others: list[Record]) -> Comparison | None:
-    """Compare two arms over the rollouts (seed, task, variation) that both have; None where they share none.
+    """Compare two arms over the variations that both were rolled out on; None where they share none.
 
-    An arm of one training seed is compared with every training of the other: picking the one of equal number would
-    compare with a lucky or an unlucky one. Not so arms on the same world model, which share the training of a seed.
+    Each training of the one is paired with each of the other: equal training seeds make two trainings no more alike
+    than unequal ones, and picking one would compare with a lucky or an unlucky one. Only arms on a shared world model
+    (`SHARING_WORLD_MODEL`) are paired seed by seed: there a seed is one world model, good or bad for both.
 
-    The difference is averaged over the shared seeds of a variation, the variations of a task and then the tasks. The
-    interval is a percentile bootstrap that resamples variations within each task: a variation is drawn with all of
-    its seeds, since rollouts on one variation are not independent. It covers the choice of variations; the training
-    seeds are taken as they are.
+    The difference is averaged over the pairs of a variation, the variations of a task and then the tasks. The interval
+    is a percentile bootstrap that resamples variations within each task: a variation is drawn with all of its pairs,
+    since rollouts on one variation are not independent. It covers the choice of variations; the trainings are taken as
+    they are.
     """
-    ours, theirs = _outcomes(records), _outcomes(others)
-    if not on_one_world_model(records[0]["arm"], others[0]["arm"]):
-        ours = _for_every_seed(ours, theirs)
-        theirs = _for_every_seed(theirs, ours)
-    shared = sorted(ours.keys() & theirs.keys(), key=str)
-    if not shared:
+    arm, other = records[0]["arm"], others[0]["arm"]
+    seed_by_seed = {arm, other} <= SHARING_WORLD_MODEL
+    ours, theirs = _by_variation(records), _by_variation(others)
+    trainings: set[tuple[int | None, int | None]] = set()
+    pairs: dict[str, list[list[int]]] = {}  # task -> variation -> differences of its pairs
+    for task, variation in sorted(ours.keys() & theirs.keys(), key=str):
+        found = {
+            (seed, other_seed): success - other_success
+            for seed, success in ours[task, variation].items()
+            for other_seed, other_success in theirs[task, variation].items()
+            if not seed_by_seed or seed == other_seed
+        }
+        if found:
+            pairs.setdefault(task, []).append(list(found.values()))
+            trainings |= found.keys()
+    if not pairs:
         return None
-    by_variation: dict[str, dict[int, list[int]]] = {}  # task -> variation -> differences by seed
-    for seed, task, variation in shared:
-        pair = (seed, task, variation)
-        by_variation.setdefault(task, {}).setdefault(variation, []).append(ours[pair] - theirs[pair])
     rng = np.random.default_rng(RNG_SEED)
     differences, draws = [], []
-    for variations in by_variation.values():
-        clusters = np.array([np.mean(seeds) for seeds in variations.values()])  # (V,)
+    for variations in pairs.values():
+        clusters = np.array([np.mean(found) for found in variations])  # (V,)
         differences.append(clusters.mean())
         draws.append(resample(clusters, rng).mean(axis=1))  # (N,)
-    only_arm = sum(ours[pair] > theirs[pair] for pair in shared)
-    only_other = sum(ours[pair] < theirs[pair] for pair in shared)
-    single_seed = len({seed for seed, _, _ in shared}) == 1
+    flat = [pair for variations in pairs.values() for found in variations for pair in found]
+    only_arm, only_other = flat.count(1), flat.count(-1)
     return Comparison(
-        arm=records[0]["arm"],
-        other=others[0]["arm"],
-        n_pairs=len(shared),
+        arm=arm,
+        other=other,
+        n_pairs=len(flat),
         difference=100 * float(np.mean(differences)),
         interval=percentile_interval(100 * np.mean(draws, axis=0)),
         only_arm=only_arm,
         only_other=only_other,
-        p_value=_mcnemar(only_arm, only_other) if single_seed else None,
+        p_value=_mcnemar(only_arm, only_other) if len(trainings) == 1 else None,
     )
 
 
@@ -98,20 +102,12 @@ def compare_arms(records: list[Record]) -> dict[str, list[Comparison]]:
     return {arm: results for arm, results in found.items() if results}
 
 
-def _outcomes(records: list[Record]) -> Outcomes:
-    return {(record["seed"], record["task"], record["variation"]): record["success"] for record in records}
-
-
-def _for_every_seed(outcomes: Outcomes, others: Outcomes) -> Outcomes:
-    """The outcomes, of one training seed, under each of the others' seeds; of several, as they are."""
-    if len({seed for seed, _, _ in outcomes}) > 1:
-        return outcomes
-    seeds = {seed for seed, _, _ in others}
-    return {
-        (seed, task, variation): success
-        for (_, task, variation), success in outcomes.items()
-        for seed in seeds
-    }
+def _by_variation(records: list[Record]) -> dict[tuple[str, int], dict[int | None, bool]]:
+    """Success by (task, variation), then by training seed."""
+    found: dict[tuple[str, int], dict[int | None, bool]] = {}
+    for record in records:
+        found.setdefault((record["task"], record["variation"]), {})[record["seed"]] = record["success"]
+    return found
 
 
 def _mcnemar(only_arm: int, only_other: int) -> float:

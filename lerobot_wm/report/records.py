@@ -49,12 +49,13 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
     """All records of the files, in order.
 
     Raises:
-        ValueError: when a line is not a record, when a rollout occurs twice, when one arm has two presets, or when
-            there is no record at all.
+        ValueError: when a line is not a record, when a rollout occurs twice, when one arm has two presets, when a
+            variation is seen here and unseen there, or when there is no record at all.
     """
     records: list[Record] = []
     origins: dict[tuple, str] = {}
     presets: dict[str, str] = {}
+    seen: dict[tuple[str, int], tuple[bool | None, str]] = {}
     for path in paths:
         for number, line in enumerate(path.read_text().splitlines(), start=1):
             record = _parse(line, where=f"{path}:{number}")
@@ -70,6 +71,15 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
                 raise ValueError(
                     f"{path}:{number}: arm '{record['arm']}' has preset '{record['preset']}' here, '{preset}' before. "
                     "The seeds of an arm are pooled: report the presets apart, or evaluate under another --arm."
+                )
+            first_seen, origin = seen.setdefault(
+                (record["task"], record["variation"]), (record["seen"], origins[rollout])
+            )
+            if first_seen is not record["seen"]:
+                raise ValueError(
+                    f"{path}:{number}: variation {record['variation']} of {record['task']} has seen {record['seen']} "
+                    f"here, {first_seen} at {origin}: positions of different sets (--env.variation_set), which "
+                    "cannot be compared one by one. Report each set apart."
                 )
             records.append(record)
     if not records:

@@ -17,11 +17,11 @@ IQL_NOTE = (
     "IQL is nearly BC. The IQL arms have β 0.5; the sweep is wm_iql_beta0, wm_iql_beta3, wm_iql_beta10."
 )
 PAIRED = (
-    "Percentage points over the rollouts (seed, task, variation) that both arms made; an arm of one training is paired "
-    "with each training of the other, but for arms on the same world model. [95% bootstrap interval]: "
-    "variations are resampled within each task, each with all its seeds; it covers the choice of variations, not of "
-    "training seeds. won–lost: only the one, only the other succeeded. p: exact McNemar test where there is one seed, "
-    "not corrected for the number of comparisons."
+    "Percentage points over the variations that both arms were rolled out on; each training of the one is paired with "
+    "each of the other, but for arms on a shared world model, which are paired by training seed. [95% bootstrap "
+    "interval]: variations are resampled within each task, each with all its pairs; it covers the choice of "
+    "variations, not of trainings. won–lost: pairs in which only the one, only the other succeeded. p: exact McNemar "
+    "test where both have one training, not corrected for the number of comparisons."
 )
 
 

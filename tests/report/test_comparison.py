@@ -5,6 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from lerobot_wm.experiment.arms import ARMS as EXPERIMENT_ARMS
+from lerobot_wm.experiment.arms import WM_RSSM
+from lerobot_wm.report.arms import SHARING_WORLD_MODEL
 from lerobot_wm.report.comparison import compare, compare_arms
 from lerobot_wm.report.records import Record
 
@@ -60,7 +63,7 @@ def test_seeds_of_one_variation_are_not_independent(make_records: Callable) -> N
     other = {"reach-v3": (2, 10), "window-close-v3": (9, 10)}
     one = compare(make_records("wm_bc", TASKS), make_records("e2e_bc", other))
     several = compare(five("wm_bc", TASKS), five("e2e_bc", other))
-    assert several.n_pairs == 5 * one.n_pairs
+    assert several.n_pairs == 5 * 5 * one.n_pairs
     assert several.interval == pytest.approx(one.interval)
     assert several.p_value is None
 
@@ -87,6 +90,30 @@ def test_one_training_is_compared_with_every_training_of_the_other(make_records:
         assert (found.only_arm, found.only_other) == (25, 25)
         assert compare(once, lucky + unlucky).difference == 0
     assert compare(lucky, once).p_value < 0.001, "one training of each: the pairs are independent"
+
+
+def test_equal_seeds_of_unrelated_trainings_are_no_pairs(make_records: Callable) -> None:
+    """Two trainings of each: seed 0 of the one has nothing in common with seed 0 of the other."""
+    rng = np.random.default_rng(0)
+    ours = [
+        with_outcomes(run, rng.random(100) < 0.7) for run in (make_records("wm_bc", TASKS, s) for s in (0, 1))
+    ]
+    theirs = [make_records("e2e_bc", {"reach-v3": (9, 39), "window-close-v3": (1, 2)}, s) for s in (0, 1)]
+    theirs[1] = with_outcomes(theirs[1], rng.random(100) < 0.4)
+    straight = compare(ours[0] + ours[1], theirs[0] + theirs[1])
+    renumbered = [[r | {"seed": 1 - r["seed"]} for r in run] for run in theirs]
+    assert straight == compare(ours[0] + ours[1], renumbered[0] + renumbered[1])
+    assert (straight.n_pairs, straight.p_value) == (400, None)
+    mean = [np.mean([r["success"] for run in runs for r in run]) for runs in (ours, theirs)]
+    assert straight.difference == pytest.approx(100 * (mean[0] - mean[1]))
+
+
+def test_arms_on_a_shared_world_model_are_paired_by_seed(make_records: Callable) -> None:
+    """And the variant with a world model of its own is not among them: its one training meets all of ours."""
+    ours = [r for seed in (0, 1) for r in make_records("wm_bc", TASKS, seed)]
+    assert compare(ours, make_records("wm_iql_beta0", TASKS, 1)).n_pairs == 100
+    assert compare(ours, make_records("wm_proprio_bc", TASKS, 1)).n_pairs == 200
+    assert {arm.name for arm in EXPERIMENT_ARMS.values() if arm.encoder == WM_RSSM} == SHARING_WORLD_MODEL
 
 
 def test_world_model_arms_are_compared_with_every_other(make_records: Callable) -> None:

@@ -44,6 +44,18 @@ def test_one_arm_under_two_presets_is_refused(make_records: Callable, tmp_path: 
         read_records([path])
 
 
+def test_positions_of_different_sets_are_refused(make_records: Callable, tmp_path: Path) -> None:
+    """Variation 3 of set 42 is collected on, variation 3 of set 43 is another place."""
+    path = tmp_path / "records.jsonl"
+    elsewhere = [record | {"seen": False} for record in make_records("e2e_bc", {"reach-v3": (1, 1)})]
+    path.write_text("".join(map(record_line, make_records("wm_bc", {"reach-v3": (1, 1)}) + elsewhere)))
+    with pytest.raises(
+        ValueError,
+        match=r"records\.jsonl:51: variation 0 of reach-v3 has seen False here, True at .*:1: positions",
+    ):
+        read_records([path])
+
+
 def test_lines_that_are_not_records_are_named(records_file: Path) -> None:
     good = records_file.read_text().splitlines()[0]
     without_steps = json.loads(good)
