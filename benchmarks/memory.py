@@ -110,8 +110,8 @@ def frames_file(root: Path) -> Path:
 class ResidentDataset(RamDataset):
     """The same, with the frames copied into the process's own memory."""
 
-    def _resident(self, frames: Tensor) -> Tensor:
-        return frames.clone()
+    def _resident(self, cameras: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {key: frames.clone() for key, frames in cameras.items()}
 
 
 def windows_per_second(source: RamDataset, batches: Iterable[list[int]]) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as command
+from benchmarks import memory
 from benchmarks.environments import OWN, PINS
 from benchmarks.measure import SideError, Spread, check_losses, measure_row, speed_up
 from benchmarks.rows import ROWS, Row, Side
@@ -192,3 +193,12 @@ def test_real_row_through_the_command_line(tmp_path: Path) -> None:
     assert result["row"] == "collection"
     assert result["ours"] > 0
     assert result["sizes"] == {"episodes_per_task": 1, "workers": 2, "threads": 1}
+
+
+def test_frames_are_read_from_ram_and_from_a_memory_map(tmp_path: Path) -> None:
+    root = memory.make_dataset(tmp_path, gigabytes=0.01)
+    speeds = memory.reading_speeds(root)
+    assert {side: len(found) for side, found in speeds.items()} == dict.fromkeys(
+        ("RAM", "warm", "cold"), memory.REPEATS
+    )
+    assert min(min(found) for found in speeds.values()) > 0
