@@ -7,8 +7,11 @@ from pathlib import Path
 
 import draccus
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
+from lerobot_wm.data.check import check_dataset
 from lerobot_wm.policies.cameras import side_by_side
+from lerobot_wm.report.episodes import episodes_by_task
 from lerobot_wm.report.inline import PNG, SVG, figure_bytes
 from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model
 from lerobot_wm.report.provenance import provenance
@@ -48,8 +51,8 @@ class QualityConfig:
         world_model_path: Folder or Hub id of a wm_rssm, wm_bc or wm_iql checkpoint.
         dataset: Episodes to judge it on, of variations it was not trained on.
         output_dir: Where quality.json and the figures go.
-        train_dataset: What it was trained on; probes are fitted on it. Without it they are fitted and tested
-            on `dataset` by cross-validation over variations.
+        train_dataset: What it was trained on; probes are fitted on its episodes of the tasks of `dataset`, and it
+            has each of them. Without it they are fitted and tested on `dataset` by cross-validation over variations.
         seed: Seed of every random choice.
         episodes_per_task: Episodes of each task of `dataset`, spread over its variations.
     """
@@ -132,8 +135,10 @@ def _read_datasets(cfg: QualityConfig, cameras: list[str]) -> tuple[list[Episode
     """Episodes of the training data (none where it is not given) and those to judge on."""
     training = []
     if cfg.train_dataset is not None:
+        source = cfg.train_dataset
+        tasks = _tasks_of_both(source, cfg.dataset)
         training = read_episodes(
-            cfg.train_dataset.repo_id, cfg.train_dataset.root, cameras, PROBE_EPISODES_PER_TASK, cfg.seed
+            source.repo_id, source.root, cameras, PROBE_EPISODES_PER_TASK, cfg.seed, tasks
         )
     judged_on = cfg.dataset.repo_id
     episodes = read_episodes(judged_on, cfg.dataset.root, cameras, cfg.episodes_per_task, cfg.seed)
@@ -144,6 +149,38 @@ def _read_datasets(cfg: QualityConfig, cameras: list[str]) -> tuple[list[Episode
             "prediction with shuffled actions needs 2."
         )
     return training, episodes
+
+
+def _tasks_of_both(training: QualityDatasetConfig, judged_on: QualityDatasetConfig) -> list[str]:
+    """The tasks to judge on; a warning where there is training data of others, of which nothing can be tested.
+
+    Raises:
+        DatasetError: A dataset is not whole.
+        ValueError: There is no training data of a task to judge on.
+    """
+    trained, judged = _tasks(training), _tasks(judged_on)
+    missing = [task for task in judged if task not in trained]
+    if missing:
+        raise ValueError(
+            f"{training.repo_id} has no episode of {', '.join(missing)}, which {judged_on.repo_id} has; it has "
+            f"{', '.join(trained)}: probes of a task are fitted on its training data. Judge on episodes of tasks that "
+            "the world model was trained on, or leave out --train_dataset for probes by cross-validation."
+        )
+    left_out = [task for task in trained if task not in judged]
+    if left_out:
+        logger.warning(
+            "%s has no episode of %s (of %s): the world model is not judged on that.",
+            judged_on.repo_id,
+            ", ".join(left_out),
+            training.repo_id,
+        )
+    return judged
+
+
+def _tasks(data: QualityDatasetConfig) -> list[str]:
+    """The tasks that a dataset has episodes of."""
+    check_dataset(data.repo_id, data.root)
+    return list(episodes_by_task(LeRobotDatasetMetadata(data.repo_id, data.root)))
 
 
 def _count_seen(training: list[Episode], episodes: list[Episode]) -> int:

@@ -1,5 +1,6 @@
 """Demonstrations and what the world model's filter makes of them, in memory."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import pandas as pd
@@ -73,9 +74,22 @@ def choose_episodes(episodes: pd.DataFrame, per_task: int, seed: int) -> list[in
 
 
 def read_episodes(
-    repo_id: str, root: str | None, cameras: list[str], per_task: int, seed: int
+    repo_id: str,
+    root: str | None,
+    cameras: list[str],
+    per_task: int,
+    seed: int,
+    of_tasks: Collection[str] | None = None,
 ) -> list[Episode]:
     """Episodes of a Meta-World dataset; only those chosen are decoded.
+
+    Args:
+        repo_id: The dataset's name.
+        root: Its folder; None for LeRobot's own place.
+        cameras: Whose frames are read.
+        per_task: Episodes wanted of each task.
+        seed: Seed of the choice, see `choose_episodes`.
+        of_tasks: The tasks whose episodes are wanted; None for all.
 
     Raises:
         DatasetError: The dataset is not whole.
@@ -94,6 +108,9 @@ def read_episodes(
             for key in ("episode_index", "task_index", VARIATION)
         }
     )
+    tasks = [str(task) for task in dataset.meta.tasks.index]
+    if of_tasks is not None:
+        table = table[table["task_index"].isin([i for i, task in enumerate(tasks) if task in of_tasks])]
     chosen = choose_episodes(table.drop_duplicates("episode_index"), per_task, seed)
     dataset = LeRobotDataset(repo_id, root=root, episodes=chosen)
     of_cameras = [camera_frames(dataset, key) for key in cameras]  # (N, H, W, C) each, by absolute index
@@ -103,7 +120,6 @@ def read_episodes(
     }
     _, lengths = torch.unique_consecutive(columns["episode_index"], return_counts=True)
     per_episode = {key: column.split(lengths.tolist()) for key, column in columns.items()}
-    tasks = [str(task) for task in dataset.meta.tasks.index]
     return [
         Episode(
             task=tasks[int(per_episode["task_index"][i][0])],

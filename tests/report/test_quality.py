@@ -4,6 +4,7 @@ import json
 import logging
 import shutil
 import sys
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -103,6 +104,65 @@ def test_fitted_on_the_training_data(
     assert "4 of 4 episodes start from positions of the training data" in caplog.text
     text = Section(quality_section(tmp_path / "quality.json")).text
     assert "4 of them start from object and goal positions of its training data" in text
+
+
+@pytest.fixture(scope="module")
+def reach_root(tmp_path_factory: pytest.TempPathFactory, lerobot_wm_command: Callable[..., None]) -> Path:
+    """Demonstrations of one of the two tasks of `demos_root`, on the other set of variations."""
+    root = tmp_path_factory.mktemp("reach") / "dataset"
+    lerobot_wm_command(
+        "collect --tasks=reach-v3 --episodes_per_task=3 --variations=0-2 --variation_set=43",
+        f"--repo_id=test/reach --root={root} --num_workers=1",
+    )
+    return root
+
+
+def test_tasks_of_the_training_data_alone_are_left_out(
+    demos_root: Path,
+    reach_root: Path,
+    world_model_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        run(
+            monkeypatch,
+            f"--world_model_path={world_model_path}",
+            "--dataset.repo_id=test/reach",
+            f"--dataset.root={reach_root}",
+            "--train_dataset.repo_id=test/demos",
+            f"--train_dataset.root={demos_root}",
+            f"--output_dir={tmp_path}",
+        )
+    assert "test/reach has no episode of Push and close a window (of test/demos)" in caplog.text
+    result = json.loads((tmp_path / "quality.json").read_text())
+    assert {row["task"] for row in result["probes"]} == {"Reach a goal position", "mean of tasks"}
+    assert result["task_probe"] == []
+
+
+def test_tasks_without_training_data_are_refused(
+    demos_root: Path,
+    reach_root: Path,
+    world_model_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    message = (
+        r"no episode of Push and close a window, which test/demos has; it has Reach a goal position: .* or leave out "
+        "--train_dataset"
+    )
+    with pytest.raises(ValueError, match=message):
+        run(
+            monkeypatch,
+            f"--world_model_path={world_model_path}",
+            "--dataset.repo_id=test/demos",
+            f"--dataset.root={demos_root}",
+            "--train_dataset.repo_id=test/reach",
+            f"--train_dataset.root={reach_root}",
+            f"--output_dir={tmp_path / 'out'}",
+        )
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_untrained_model_has_other_weights_and_the_same_scaling(world_model_path: Path) -> None:
