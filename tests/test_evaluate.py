@@ -245,6 +245,21 @@ def test_earlier_records_are_never_overwritten(policy_path: Path, tmp_path: Path
         evaluate(config_for(policy_path, tmp_path, WalkEnvConfig(), 2, 2))
 
 
+def test_videos_of_an_earlier_evaluation_are_removed(policy_path: Path, tmp_path: Path) -> None:
+    # A rollout that fails now would be shown beside its earlier success.
+    folder = tmp_path / "videos" / "near"
+    folder.mkdir(parents=True)
+    for name in ("variation_00_success", "variation_00_failure", "variation_05_failure", "own"):
+        (folder / f"{name}.mp4").write_text("")
+    records = evaluate(config_for(policy_path, tmp_path, WalkEnvConfig(), 2, 1, videos_per_task=2))
+    written = {
+        f"variation_{r['variation']:02d}_{'success' if r['success'] else 'failure'}.mp4"
+        for r in records
+        if r["task"] == "near"
+    }
+    assert {path.name for path in folder.iterdir()} == {*written, "own.mp4"}
+
+
 def test_repeated_variations_are_refused(policy_path: Path, tmp_path: Path) -> None:
     cfg = config_for(policy_path, tmp_path, MetaworldMTEnvConfig(task="reach-v3", split="seen"), 11, 4)
     with pytest.raises(ValueError, match=r"use --eval\.n_episodes=10"):

@@ -56,7 +56,10 @@ class TaskRunner:
         }
 
     def run(self, task: str) -> list[Record]:
-        """Roll out every seed of one task once."""
+        """Roll out every seed of one task once; its videos of an earlier evaluation are removed."""
+        # Written over, a rollout that now ends otherwise would leave both outcomes.
+        for video in self._videos(task).glob("variation_*_*.mp4"):
+            video.unlink()
         # Per task: a stochastic policy's rollouts must not depend on how tasks are spread over processes.
         set_seed(self.cfg.seed)
         records: list[Record] = []
@@ -85,11 +88,14 @@ class TaskRunner:
         for column, i in enumerate(filmed):
             clip = [step[column] for step in frames[: records[i]["steps"] + 1]]
             outcome = "success" if records[i]["success"] else "failure"
-            folder = self.cfg.output_dir / "videos" / task
+            folder = self._videos(task)
             folder.mkdir(parents=True, exist_ok=True)
             path = folder / f"variation_{records[i]['variation']:02d}_{outcome}.mp4"
             write_video(path, [_enlarged(frame) for frame in clip], env.metadata["render_fps"])
         return records
+
+    def _videos(self, task: str) -> Path:
+        return self.cfg.output_dir / "videos" / task
 
     def _record(self, task: str, seed: int, data: dict[str, torch.Tensor], i: int) -> Record:
         steps = int(data["done"][i].int().argmax()) + 1  # argmax: the first True
