@@ -1,4 +1,4 @@
-"""A map of the latent space: the states s_t of whole episodes, projected to the plane by PCA."""
+"""A map of the latent space: the states s_t of some episodes, projected to the plane by PCA."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,20 +21,24 @@ from lerobot_wm.report.episodes import episodes_by_task, read_episodes
 from lerobot_wm.world_model.model import WorldModel
 
 MAX_EPISODES = 48  # of all tasks together, but at least one of each
-FRAMES_PER_EPISODE = 40  # drawn, spread evenly over it
+MAX_FRAMES = (
+    500  # of an episode, its first: all of Meta-World's, and a bound to time and memory for longer ones
+)
+FRAMES_PER_EPISODE = 40  # drawn, spread evenly over what is read of it
 
 
 @dataclass(frozen=True)
 class LatentMap:
-    """N latents of an episode sample, in random order.
+    """N latents of an episode sample, in random order; of each episode the first `max_frames` at most.
 
     `points` (N, 2) are their first two principal components and `explained` the share of the variance that each of
-    the two holds. `task` (N,) are positions in `tasks`; `time` (N,) runs from 0, the episode's first frame, to 1, its
-    last.
+    the two holds. `task` (N,) are positions in `tasks`; `time` (N,) runs from 0, the episode's first frame, to 1, the
+    last that was read.
     """
 
     tasks: list[str]
     n_episodes: int
+    max_frames: int
     n_dims: int
     points: np.ndarray
     explained: np.ndarray
@@ -51,7 +55,7 @@ class LatentMap:
 def latent_map(
     policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, root: str | Path | None
 ) -> LatentMap:
-    """Filter the last episodes of each task and project their latents, z_t at its posterior mean.
+    """Filter the last episodes of each task, up to MAX_FRAMES, and project their latents, z_t at its posterior mean.
 
     Args:
         policy: Holds the world model.
@@ -65,7 +69,7 @@ def latent_map(
     episodes = sorted(index for of_task in by_task.values() for index in of_task[-per_task:])
     tasks = list(by_task)
     latents, task, time = [], [], []
-    read = read_episodes(policy, meta, root, episodes)
+    read = read_episodes(policy, meta, root, episodes, MAX_FRAMES)
     for episode in tqdm(read, total=len(episodes), desc="Mapping", unit="episode"):
         batch = {key: value[None].to(policy.config.device) for key, value in episode.items() if key != TASK}
         proprio = batch[OBS_STATE] if world_model.config.use_proprio else None
@@ -85,6 +89,7 @@ def latent_map(
     return LatentMap(
         tasks=tasks,
         n_episodes=len(episodes),
+        max_frames=MAX_FRAMES,
         n_dims=stacked.shape[1],
         points=points[order],
         explained=pca.explained_variance_ratio_,

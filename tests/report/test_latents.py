@@ -10,6 +10,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wm.constants import ACTION, OBS_IMAGE
 from lerobot_wm.report.latents import FRAMES_PER_EPISODE, LatentMap, latent_figures, latent_map, task_colours
 from lerobot_wm.report.open_loop import load_world_model
+from lerobot_wm.world_model.rssm import RSSMState
 from tests.report.quality_model import lively_world_model
 
 
@@ -60,6 +61,27 @@ def test_each_point_has_its_task_and_its_time(latents: LatentMap, dataset: LeRob
         first = latents.points[(latents.task == task) & (latents.time == 0)]
         spread = np.linalg.norm(first[0] - first[1])
         assert spread < 0.05 * np.ptp(latents.points[:, 0])
+
+
+def test_long_episodes_are_read_to_a_bound(
+    dataset: LeRobotDataset, world_model_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Whole episodes of ten thousand frames took minutes and gigabytes.
+    monkeypatch.setattr("lerobot_wm.report.latents.MAX_FRAMES", 20)
+    policy = load_world_model(str(world_model_path))
+    read = []
+    model_filter = policy.world_model.filter
+
+    def noting(images: torch.Tensor, *rest: torch.Tensor | None) -> RSSMState:
+        read.append(images.shape[1])
+        return model_filter(images, *rest)
+
+    monkeypatch.setattr(policy.world_model, "filter", noting)
+    found = latent_map(policy, dataset.meta, dataset.root)
+    assert sorted(read) == [6, 6, 20, 20]
+    assert found.max_frames == 20
+    assert np.bincount(found.task).tolist() == [20 + 6] * 2
+    assert found.time.max() == 1
 
 
 def test_figures_colour_by_task_and_by_time(latents: LatentMap) -> None:
