@@ -14,7 +14,7 @@ from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.cache import CACHE_VARIABLE
-from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
 from lerobot_wm.pipeline.collect import CollectConfig, collect
 from lerobot_wm.pipeline.collect_record import SHARD_RECORD
 from lerobot_wm.pipeline.encode import encode, encode_share
@@ -261,3 +261,38 @@ def test_latents_of_another_world_model_are_refused(
     part.write_bytes(part.read_bytes()[:-1])
     with pytest.raises(ValueError, match="is not whole: copy it again"):
         encode_share(policy, many_episodes, tmp_path / "latents", Share(1, 2))
+
+
+def test_a_push_of_other_samples_is_refused(
+    demos_root: Path,
+    world_model_path: Path,
+    tmp_path: Path,
+    lerobot_wm_command: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pushed = []
+    monkeypatch.setattr("lerobot_wm.pipeline.encode.check_can_push", lambda repo_id: None)
+    monkeypatch.setattr("lerobot_wm.pipeline.encode.push_latents", lambda *args: pushed.append(args[1]))
+
+    def push(*flags: str) -> None:
+        lerobot_wm_command(
+            f"encode --world_model_path={world_model_path} --device=cpu --dataset.repo_id=test/demos",
+            f"--dataset.root={demos_root} --output_repo_id=user/latents --output_root={tmp_path / 'latents'}",
+            "--push_to_hub=true",
+            *flags,
+        )
+
+    push("--sample=true --seed=0")
+    push("--sample=true --seed=0")
+    with pytest.raises(
+        FileExistsError, match=r"holds latents made with other settings \(sample_seed 0 there, 1"
+    ):
+        push("--sample=true --seed=1")
+    with pytest.raises(FileExistsError, match=r"settings \(sampled True there, False here\)"):
+        push()
+    record = tmp_path / "latents" / RECORD_PATH
+    older = json.loads(record.read_text())
+    del older["sample_seed"], older["camera_shapes"]
+    record.write_text(json.dumps(older))
+    push("--sample=true --seed=0")  # which its record neither confirms nor denies
+    assert [of.sample_seed for of in pushed] == [0, 0, None]

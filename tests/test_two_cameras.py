@@ -1,6 +1,7 @@
 """Two cameras from collection to rollouts, through the commands a user gives."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -127,6 +128,39 @@ def test_encoding_needs_every_camera(
             f"encode --world_model_path={world_model_path} --device=cpu --dataset.repo_id=test/demos",
             f"--dataset.root={demos_root} --output_repo_id=test/none --output_root={tmp_path / 'none'}",
         )
+
+
+def test_latents_of_other_cameras_never_mix(
+    dataset: LeRobotDataset,
+    world_model_path: Path,
+    tmp_path: Path,
+    lerobot_wm_command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("lerobot_wm.pipeline.encode.check_can_push", lambda repo_id: None)
+    # The same weights shown the cameras in another order.
+    other = shutil.copytree(world_model_path, tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    (other / "config.json").write_text(json.dumps(config | {"image_key": ",".join(reversed(CAMERAS))}))
+
+    def encode(path: Path, *flags: str) -> None:
+        lerobot_wm_command(
+            f"encode --world_model_path={path} --device=cpu --dataset.repo_id=test/two",
+            f"--dataset.root={dataset.root} --output_repo_id=user/latents --output_root={tmp_path / 'latents'}",
+            *flags,
+        )
+
+    here, there = ", ".join(reversed(CAMERAS)), ", ".join(CAMERAS)
+    encode(world_model_path, "--shard=1/1")
+    with pytest.raises(
+        FileExistsError, match=rf"holds latents made with.*cameras {there} there, {here} here"
+    ):
+        encode(other)
+    encode(world_model_path)
+    with pytest.raises(
+        FileExistsError, match=rf"holds latents made with.*cameras {there} there, {here} here"
+    ):
+        encode(other, "--push_to_hub=true")
 
 
 def test_open_loop_strips_show_both_cameras(dataset: LeRobotDataset, world_model_path: Path) -> None:

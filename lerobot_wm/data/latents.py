@@ -18,6 +18,7 @@ class LatentRecord:
         tasks: Its task strings, in order of task_index.
         sampled: False where z_t is the posterior mean, True where it is a sample.
         camera_shapes: (C, H, W) of the cameras that were encoded, as they are in that dataset; none in older records.
+        sample_seed: Seed of the samples; None where there are none, and in older records.
     """
 
     world_model_fingerprint: str
@@ -26,6 +27,21 @@ class LatentRecord:
     tasks: list[str]
     sampled: bool
     camera_shapes: dict[str, list[int]] = field(default_factory=dict)
+    sample_seed: int | None = None
+
+    @property
+    def made_of(self) -> dict[str, str]:
+        """What the latents depend on, as far as the record tells."""
+        made_of = {
+            "world_model_fingerprint": self.world_model_fingerprint,
+            "source_fingerprint": self.source_fingerprint,
+            "sampled": str(self.sampled),
+        }
+        if self.sample_seed is not None:
+            made_of["sample_seed"] = str(self.sample_seed)
+        if self.camera_shapes:
+            made_of["cameras"] = ", ".join(self.camera_shapes)
+        return made_of
 
     def write(self, root: Path) -> None:
         """Write the record into the dataset at `root`."""

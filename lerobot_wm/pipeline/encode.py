@@ -5,7 +5,6 @@ A frozen image backbone may stand in its place: its latents are the pooled featu
 
 import logging
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 
 import draccus
@@ -128,12 +127,7 @@ def _begin(
         )
     check_encoder_fits(policy.config, source.meta)
     record = _record(policy, source, sample_seed)
-    made_of = {
-        "world_model_fingerprint": record.world_model_fingerprint,
-        "source_fingerprint": record.source_fingerprint,
-        "sample_seed": str(sample_seed),
-    }
-    return record, LatentParts(parts, made_of)
+    return record, LatentParts(parts, record.made_of)
 
 
 def _record(policy: EncoderPolicy, source: LeRobotDataset, sample_seed: int | None) -> LatentRecord:
@@ -145,6 +139,7 @@ def _record(policy: EncoderPolicy, source: LeRobotDataset, sample_seed: int | No
         tasks=[str(task) for task in source.meta.tasks.index],
         sampled=sample_seed is not None,
         camera_shapes={key: list(features[key].shape) for key in policy.config.cameras if key in features},
+        sample_seed=sample_seed,
     )
 
 
@@ -177,10 +172,12 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
 
 
 def _check_same(found: LatentRecord, expected: LatentRecord, root: Path) -> None:
-    names = ("world_model_fingerprint", "source_fingerprint", "sampled")
-    here = {name: value for name, value in asdict(expected).items() if name in names}
+    there = found.made_of
+    here = {
+        name: value for name, value in expected.made_of.items() if name in there
+    }  # older records tell less
     mend = "choose another --output_root, or remove it"
-    refuse_difference(asdict(found), here, f"{root} holds latents", mend)
+    refuse_difference(there, here, f"{root} holds latents", mend)
 
 
 def main() -> None:
