@@ -185,6 +185,13 @@ def test_data_and_rollouts_have_the_presets_cameras(tmp_path: Path) -> None:
     assert load_preset("cpu").camera_name == "corner2"
 
 
+def test_all_rollouts_have_the_presets_length(tmp_path: Path) -> None:
+    short = Plan(replace(load_preset("cpu"), episode_length=70), tmp_path)
+    for arm, flag in (("wm_bc", "--env.episode_length=70"), ("expert", "--episode_length=70")):
+        [evaluation] = short.evaluations(ARMS[arm], 0)
+        assert flag in evaluation.argv
+
+
 def test_runs_are_chosen_by_arms_and_seeds() -> None:
     preset = load_preset("cpu")
 

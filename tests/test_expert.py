@@ -58,9 +58,26 @@ def test_the_second_set_has_its_own_rollouts(
     assert [r["steps"] for r in second] != [r["steps"] for r in records[:3]]
 
 
+def test_rollouts_end_where_the_environments_do(
+    records: list[Record], tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    longest = max(records[:3], key=lambda record: record["steps"])
+    assert longest["success"]
+    for length in (longest["steps"], longest["steps"] - 1):
+        flags = f"--tasks=reach-v3 --variations=8-10 --episode_length={length} --num_workers=1"
+        lerobot_wm_command(f"expert {flags} --output_dir={tmp_path / str(length)}")
+        for record, whole in zip(
+            read_records([tmp_path / str(length) / "records.jsonl"]), records[:3], strict=True
+        ):
+            success = whole["steps"] <= length
+            assert (record["success"], record["return"]) == (success, float(success))
+            assert record["steps"] == min(whole["steps"], length)
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
+        ("--episode_length=501", "episode_length is 501; expected 1 to 500"),
         ("--tasks=reach", "did you mean reach-v3"),
         ("--variation_set=45", "one of 42, 43, 44"),
         ("--variations=50", "0 to 49"),

@@ -180,6 +180,7 @@ class Plan:
             "tasks": self.preset.tasks,
             "variation_set": self.variation_set,
             "variations": ",".join(map(str, self.preset.variations)),
+            "episode_length": self.preset.episode_length,
             "output_dir": folder,
             "preset": self.preset.name,
         }

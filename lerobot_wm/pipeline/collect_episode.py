@@ -44,9 +44,14 @@ class Demonstration:
 
 
 def demonstrate(
-    simulation: Simulation, variation: int, noise: float, steps_after_success: int, rng: np.random.Generator
+    simulation: Simulation,
+    variation: int,
+    noise: float,
+    steps_after_success: int,
+    rng: np.random.Generator,
+    max_steps: int = MAX_EPISODE_STEPS,
 ) -> Demonstration | None:
-    """Let the task's scripted expert try a variation; None if it has not succeeded after 500 steps.
+    """Let the task's scripted expert try a variation; None if it has not succeeded after `max_steps` steps.
 
     The expert's raw actions reach +-12. They are clipped to [-1, 1], Gaussian noise of standard deviation
     `noise` is added, and the sum is clipped again. The episode goes on for `steps_after_success` steps after
@@ -55,8 +60,8 @@ def demonstrate(
     expert = getattr(metaworld.policies, expert_name(simulation.task))()
     state = simulation.reset(variation)
     physics, states, actions, dense_rewards, successes = [], [], [], [], []
-    last_step = MAX_EPISODE_STEPS
-    for t in range(MAX_EPISODE_STEPS):
+    last_step = max_steps
+    for t in range(max_steps):
         action = np.clip(expert.get_action(state), -1.0, 1.0)
         action = np.clip(action + rng.normal(0.0, noise, action.shape), -1.0, 1.0).astype(np.float32)
         physics.append(simulation.save())
@@ -66,7 +71,7 @@ def demonstrate(
         dense_rewards.append(outcome.dense_reward)
         successes.append(outcome.success)
         state = outcome.state
-        if outcome.success and last_step == MAX_EPISODE_STEPS:
+        if outcome.success and last_step == max_steps:
             last_step = t + steps_after_success
         if t >= last_step:
             break

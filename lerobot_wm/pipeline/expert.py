@@ -36,6 +36,8 @@ class ExpertConfig:
     variation_set: int = REPORTED_VARIATION_SET
     # Variations to roll out on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
     variations: str = f"0-{NUM_VARIATIONS - 1}"
+    # Steps after which a rollout is a failure, at most 500; as --env.episode_length of `lerobot-wm eval`.
+    episode_length: int = MAX_EPISODE_STEPS
     # Name of the settings in records.
     preset: str = "custom"
     # Processes; each takes whole tasks.
@@ -51,6 +53,8 @@ class ExpertConfig:
         resolve_tasks(self.tasks)
         check_variation_set(self.variation_set)
         parse_variations(self.variations)
+        if not 1 <= self.episode_length <= MAX_EPISODE_STEPS:
+            raise ValueError(f"episode_length is {self.episode_length}; expected 1 to {MAX_EPISODE_STEPS}.")
         if self.num_workers < 1:
             raise ValueError(f"--num_workers={self.num_workers}: expected at least 1.")
         if self.records_file.exists():
@@ -104,9 +108,11 @@ def _roll_out(cfg: ExpertConfig, task: str) -> list[Record]:
 
 
 def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record:
-    """One rollout: as in the environment, it ends with success or after 500 steps, and success is the reward."""
+    """One rollout: as in the environment, success or `episode_length` steps end it, and success is the reward."""
     rng = np.random.default_rng(0)  # draws nothing that matters: the noise has no width
-    demonstration = demonstrate(simulation, variation, noise=0.0, steps_after_success=0, rng=rng)
+    demonstration = demonstrate(
+        simulation, variation, noise=0.0, steps_after_success=0, rng=rng, max_steps=cfg.episode_length
+    )
     success = demonstration is not None
     return {
         "arm": ARM,
@@ -117,7 +123,7 @@ def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record
         "variation": variation,
         "seen": is_seen(variation, cfg.variation_set),
         "success": success,
-        "steps": MAX_EPISODE_STEPS if demonstration is None else len(demonstration.actions),
+        "steps": cfg.episode_length if demonstration is None else len(demonstration.actions),
         "return": float(success),
     }
 
