@@ -24,6 +24,7 @@ from lerobot_wm.pipeline.eval_config import EvaluateConfig
 from lerobot_wm.pipeline.expert import ExpertConfig
 from lerobot_wm.pipeline.init import InitConfig
 from lerobot_wm.pipeline.relabel import RelabelConfig
+from lerobot_wm.pipeline.share import parts_folder, shards_folder
 from lerobot_wm.report import arms as report_arms
 from lerobot_wm.report.build import ReportConfig
 from lerobot_wm.report.quality import QualityConfig
@@ -164,6 +165,18 @@ def test_a_training_is_finished_by_its_last_step_only(tmp_path: Path) -> None:
     assert training.resumes
     assert not training.finished
     assert "--resume=true" in training.command(cores=1)
+
+
+def test_collections_and_encodings_go_on_from_what_they_left(tmp_path: Path) -> None:
+    stages = stages_of(tmp_path, "wm_bc")
+    collection, encoding = stages["dataset"], stages["seed_0/latents_wm_rssm"]
+    assert collection.checkpoint == shards_folder(parse(collection.argv).output_root)
+    assert encoding.checkpoint == parts_folder(parse(encoding.argv).output_root)
+    for stage in (collection, encoding):
+        begun = stage.command(cores=2)
+        stage.checkpoint.mkdir(parents=True)
+        assert stage.resumes
+        assert stage.command(cores=2) == begun
 
 
 def test_selection_runs_are_kept_apart(tmp_path: Path) -> None:

@@ -145,6 +145,16 @@ def test_a_stopped_stage_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     assert (place / "checkpoint").read_text() == "step 5"
 
 
+def test_the_time_of_a_part_is_not_noted(tmp_path: Path) -> None:
+    # A collection goes on from its shards with the command it was begun with.
+    whole, rest = (
+        stage(tmp_path, name, checkpoint=tmp_path / f"{name}.shards") for name in ("whole", "rest")
+    )
+    (tmp_path / "rest.shards").mkdir()
+    assert run(tmp_path, [whole, rest])[1] == []
+    assert set(json.loads((tmp_path / "times.json").read_text())) == {"whole"}
+
+
 def test_first_what_most_waits_for(tmp_path: Path) -> None:
     short = [stage(tmp_path, f"short{i}") for i in range(2)]
     long = stage(tmp_path, "long", stage(tmp_path, "start_of_long"), kind="slow")

@@ -13,6 +13,7 @@ from lerobot_wm.constants import (
 from lerobot_wm.experiment.commands import Dataset, lerobot_wm
 from lerobot_wm.experiment.preset import Preset
 from lerobot_wm.experiment.stage import Stage
+from lerobot_wm.pipeline.share import shards_folder
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class Demonstrations:
             argv=lerobot_wm("collect", flags),
             folder=folder,
             artefact=folder / "meta" / "collection.json",
+            checkpoint=shards_folder(folder),
             takes_workers=True,
         )
         return Dataset(stage, repo_id)

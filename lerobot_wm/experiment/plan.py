@@ -20,6 +20,7 @@ from lerobot_wm.experiment.commands import Checkpoint, Dataset, lerobot_wm
 from lerobot_wm.experiment.demonstrations import Demonstrations
 from lerobot_wm.experiment.preset import Preset
 from lerobot_wm.experiment.stage import Stage
+from lerobot_wm.pipeline.share import parts_folder
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Plan:
             folder=folder,
             artefact=folder / "meta" / "latents.json",
             needs=(source.made_by, checkpoint.made_by),
+            checkpoint=parts_folder(folder),
         )
         return Dataset(stage, repo_id)
 

@@ -17,8 +17,8 @@ class Stage:
         folder: What it writes; a start from nothing removes it first.
         artefact: The file it writes last: there is one exactly when the stage is finished.
         needs: Stages that must be finished before.
-        checkpoint: The file a stopped stage goes on from; None when it has to start from nothing.
-        resume_argv: The command to go on with.
+        checkpoint: The file or folder a stopped stage goes on from; None when it has to start from nothing.
+        resume_argv: The command to go on with; none where `argv` itself goes on.
         takes_workers: Whether it spreads over the cores it is given by `--num_workers`.
     """
 
@@ -49,7 +49,7 @@ class Stage:
 
     def command(self, cores: int) -> list[str]:
         """The command to run now, with the cores it may use."""
-        argv = self.resume_argv if self.resumes else self.argv
+        argv = self.resume_argv if self.resumes and self.resume_argv else self.argv
         return [*argv, f"--num_workers={cores}"] if self.takes_workers else list(argv)
 
     def prepare(self) -> None:

@@ -22,7 +22,7 @@ from lerobot_wm.pipeline.collect_shards import TEMPORARY_PREFIX, Shard
 from lerobot_wm.pipeline.collect_workers import write_missing_shards
 from lerobot_wm.pipeline.merge import merge_datasets
 from lerobot_wm.pipeline.quiet import quiet
-from lerobot_wm.pipeline.share import Share, refuse_difference
+from lerobot_wm.pipeline.share import Share, refuse_difference, shards_folder
 
 
 def collect(config: CollectConfig) -> Path:
@@ -46,7 +46,7 @@ def collect(config: CollectConfig) -> Path:
 
 def _collect(config: CollectConfig) -> Path:
     root = config.output_root
-    folder = root.with_name(f"{root.name}.shards")
+    folder = shards_folder(root)
     if _is_complete(config, root):
         shutil.rmtree(folder, ignore_errors=True)  # left by a run killed at its very end
         print(f"{root} is already complete.")

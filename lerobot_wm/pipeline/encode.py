@@ -27,7 +27,7 @@ from lerobot_wm.pipeline.encode_config import EncodeConfig
 from lerobot_wm.pipeline.encode_episodes import episode_batches
 from lerobot_wm.pipeline.encode_parts import LatentParts
 from lerobot_wm.pipeline.quiet import quiet
-from lerobot_wm.pipeline.share import Share, refuse_difference
+from lerobot_wm.pipeline.share import Share, parts_folder, refuse_difference
 from lerobot_wm.policies.fits import check_encoder_fits
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_encoder import EncoderPolicy, encoder_fingerprint, load_encoder
@@ -111,7 +111,7 @@ def _begin(
     policy: EncoderPolicy, source: LeRobotDataset, output_root: Path, sample_seed: int | None
 ) -> tuple[LatentRecord, LatentParts]:
     """Refuse what cannot be encoded; the record of the result, and the place of its latents."""
-    parts = output_root.with_name(f"{output_root.name}.parts")
+    parts = parts_folder(output_root)
     if output_root.exists():
         shutil.rmtree(parts, ignore_errors=True)  # left by a run killed at its very end
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")

@@ -1,9 +1,10 @@
-"""`--shard=i/n`: one job's share of work that n jobs do together, on one machine or several."""
+"""`--shard=i/n`: one job's share of work that n jobs do together, on one machine or several; where shares gather."""
 
 import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 
@@ -43,6 +44,16 @@ class Share:
                 f"start at most {len(parts)} jobs."
             )
         return list(parts[self.index - 1 :: self.count])
+
+
+def shards_folder(root: Path) -> Path:
+    """Where the shards of the collection of the dataset `root` lie until they are merged."""
+    return root.with_name(f"{root.name}.shards")
+
+
+def parts_folder(root: Path) -> Path:
+    """Where the latents of the dataset `root` lie until all are encoded."""
+    return root.with_name(f"{root.name}.parts")
 
 
 def refuse_difference(found: Mapping[str, Any], expected: Mapping[str, Any], what: str, mend: str) -> None:
