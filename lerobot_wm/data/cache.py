@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames
+from lerobot.utils.constants import HF_LEROBOT_HOME
 from numpy.lib.format import open_memmap
 from torch import Tensor
 from tqdm import tqdm
@@ -22,6 +23,7 @@ from lerobot_wm.cores import usable_cores
 from lerobot_wm.data.check_info import MEND, one_line
 from lerobot_wm.data.errors import DatasetError
 from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.folder import is_snapshot
 from lerobot_wm.data.resize import resize_images
 
 logger = logging.getLogger(__name__)
@@ -35,6 +37,9 @@ _CHUNK_BYTES = 2**25
 def cache_root(dataset_root: Path) -> Path:
     """Where what is derived from a dataset lives: `<root>.cache` beside it, or under $LEROBOT_WM_CACHE.
 
+    Of a snapshot in a cache of the Hub, `$HF_LEROBOT_HOME/lerobot_wm/OWNER--NAME--COMMIT.cache`: beside it, `hf cache
+    prune` would take it for a snapshot that no branch leads to, and remove it.
+
     Decoded frames are made again when needed. The latents of a training are too when it is started anew, but one that
     is to be resumed needs them where they are.
 
@@ -42,7 +47,13 @@ def cache_root(dataset_root: Path) -> Path:
         PermissionError: The place cannot be written.
     """
     place = os.environ.get(CACHE_VARIABLE)
-    root = Path(place) / dataset_root.name if place else dataset_root.with_name(f"{dataset_root.name}.cache")
+    if place:
+        root = Path(place) / dataset_root.name
+    elif is_snapshot(dataset_root):
+        repository = dataset_root.parents[1].name.removeprefix("datasets--")
+        root = HF_LEROBOT_HOME / "lerobot_wm" / f"{repository}--{dataset_root.name}.cache"
+    else:
+        root = dataset_root.with_name(f"{dataset_root.name}.cache")
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -10,23 +10,25 @@ from pathlib import Path
 
 from datasets.exceptions import DatasetGenerationError
 from huggingface_hub.utils import validate_repo_id
-from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_wm.data.check_episodes import check_tasks, read_episodes
 from lerobot_wm.data.check_frames import check_contents, check_frames
 from lerobot_wm.data.check_info import read_info
 from lerobot_wm.data.check_stats import check_stats
 from lerobot_wm.data.check_videos import check_video_file, check_video_times
+from lerobot_wm.data.errors import DatasetError
+from lerobot_wm.data.folder import dataset_folder, is_snapshot
 
 
-def check_dataset(repo_id: str, root: str | Path | None = None) -> None:
+def check_dataset(repo_id: str, root: str | Path | None = None, revision: str | None = None) -> None:
     """Refuse a dataset on this machine that is not whole, or whose parts do not belong together.
 
-    Nothing is looked up elsewhere. A folder without any part of a dataset passes: LeRobot will download it there.
+    Nothing is looked up elsewhere. A dataset that is not here passes: LeRobot will download it.
 
     Args:
         repo_id: The dataset's name.
         root: Its folder; None looks where LeRobot does.
+        revision: As in `LeRobotDataset`.
 
     Raises:
         DatasetError: Names the file, what is wrong with it, and how to mend it.
@@ -34,15 +36,19 @@ def check_dataset(repo_id: str, root: str | Path | None = None) -> None:
     """
     if root is None:
         validate_repo_id(repo_id)
-    folder = _folder(repo_id, root)
-    if not any((folder / part).exists() for part in ("meta", "data", "videos")):
-        return
+    folder = dataset_folder(repo_id, root, revision)
+    if folder is not None:
+        with _removal_named(folder):
+            _check_folder(folder)
+
+
+def _check_folder(folder: Path) -> None:
     info = read_info(folder)
     check_stats(info)
     check_tasks(info)
     episodes = read_episodes(info)
     # Of a dataset of the Hub some episodes may be here; LeRobot downloads the others when they are asked for.
-    partial = (folder / ".cache" / "huggingface").is_dir()
+    partial = is_snapshot(folder) or (folder / ".cache" / "huggingface").is_dir()
     check_frames(info, episodes, partial)
     for camera in info.video_keys:
         check_video_times(info, camera, episodes)
@@ -52,7 +58,7 @@ def check_dataset(repo_id: str, root: str | Path | None = None) -> None:
 
 
 @contextmanager
-def damage_named(repo_id: str, root: str | Path | None) -> Iterator[None]:
+def damage_named(repo_id: str, root: str | Path | None, revision: str | None) -> Iterator[None]:
     """Name the file where LeRobot finds a table damaged that `check_dataset` passed: it reads no values.
 
     Raises:
@@ -61,9 +67,21 @@ def damage_named(repo_id: str, root: str | Path | None) -> Iterator[None]:
     try:
         yield
     except DatasetGenerationError:
-        check_contents(_folder(repo_id, root))
+        folder = dataset_folder(repo_id, root, revision)
+        if folder is not None:
+            with _removal_named(folder):
+                check_contents(folder)
         raise
 
 
-def _folder(repo_id: str, root: str | Path | None) -> Path:
-    return HF_LEROBOT_HOME / repo_id if root is None else Path(root)
+@contextmanager
+def _removal_named(folder: Path) -> Iterator[None]:
+    """Say how to have a dataset of the Hub downloaded again: what is in its cache LeRobot takes from there."""
+    try:
+        yield
+    except DatasetError as error:
+        if not is_snapshot(folder):
+            raise
+        raise DatasetError(
+            f"{error} What is in the Hub's cache is not downloaded again: remove {folder.parents[1]} first."
+        ) from error

@@ -16,9 +16,10 @@ from huggingface_hub.errors import (
     RevisionNotFoundError,
 )
 from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
-from lerobot.datasets.utils import INFO_PATH, get_repo_versions, is_valid_version
-from lerobot.utils.constants import HF_LEROBOT_HOME
+from lerobot.datasets.utils import get_repo_versions, is_valid_version
 from packaging.version import Version
+
+from lerobot_wm.data.folder import dataset_folder, is_snapshot
 
 LOGIN = "log in with `hf auth login`, or set HF_TOKEN"
 
@@ -59,15 +60,17 @@ def check_dataset_version(repo_id: str, root: str | Path | None, revision: str |
 
     Args:
         repo_id: The dataset.
-        root: Its folder, where it is on this machine; None looks where LeRobot does.
+        root: Its folder, where it is on this machine; None looks where LeRobot does, which asks the Hub for the version
+            of a dataset that it has downloaded, too.
         revision: As in `LeRobotDataset`; anything but a version such as v3.0 is left to it.
 
     Raises:
         HubRefusalError: It has no such version, or none at all.
         HfHubHTTPError, ConnectionError: There is no such dataset, or the Hub cannot be reached.
     """
-    folder = HF_LEROBOT_HOME / repo_id if root is None else Path(root)
-    if (folder / INFO_PATH).is_file() or not is_valid_version(revision or CODEBASE_VERSION):
+    folder = dataset_folder(repo_id, root, revision)
+    is_here = folder is not None and (root is not None or not is_snapshot(folder))
+    if is_here or not is_valid_version(revision or CODEBASE_VERSION):
         return
     versions = sorted(get_repo_versions(repo_id))
     if not versions:

@@ -57,7 +57,7 @@ def dream_of(cfg: DreamConfig) -> Dreams:
             size, or there is no such episode, or it is too short.
     """
     policy = load_world_model(cfg.policy.path)
-    check_dataset(cfg.dataset.repo_id, cfg.dataset.root)
+    check_dataset(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     with quiet():
         meta = LeRobotDatasetMetadata(
             cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision

@@ -19,6 +19,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot_wm.constants import OBS_LATENT, OBS_STATE
 from lerobot_wm.data.cache import cache_root
 from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.folder import dataset_folder, is_snapshot
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.hub.dataset_card import license_of, push_latents
@@ -157,8 +158,12 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
     """
     policy = load_encoder(world_model_path).to(device)
     root = Path(meta.root)
-    # Opened before it is hashed: of a dataset of the Hub only the metadata may be here yet.
-    source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
+    # Opened before it is hashed: of a dataset of the Hub only the metadata may be here yet. A snapshot by its name, or
+    # the rest would be downloaded past the Hub's cache.
+    if is_snapshot(root) and dataset_folder(repo_id, revision=root.name) == root:
+        source = LeRobotDataset(repo_id, revision=root.name)
+    else:
+        source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
     fingerprint = encoder_fingerprint(policy.world_model, cameras=policy.config.cameras)
     name = f"{LATENTS_PREFIX}{fingerprint}-{dataset_fingerprint(root)}"
     output_root = cache_root(root) / name

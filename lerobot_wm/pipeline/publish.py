@@ -13,8 +13,8 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.factory import get_policy_class
-from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from lerobot_wm.data.folder import dataset_folder
 from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.hub.markdown import escaped
 from lerobot_wm.hub.model_card import IMAGINATION, TrainingData, model_card
@@ -139,8 +139,8 @@ def _section(table: ReportTable) -> str:
 
 def _training_data(run: TrainPipelineConfig) -> TrainingData | None:
     """What the run was trained on, where that is still on this machine."""
-    root = Path(run.dataset.root) if run.dataset.root else HF_LEROBOT_HOME / run.dataset.repo_id
-    if not root.is_dir():
+    root = dataset_folder(run.dataset.repo_id, run.dataset.root, run.dataset.revision, whole=True)
+    if root is None:
         return None
     return TrainingData.of(LeRobotDatasetMetadata(run.dataset.repo_id, root=root))
 

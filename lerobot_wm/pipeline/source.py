@@ -24,9 +24,9 @@ class SourceConfig:
             DatasetError: It is not whole, or an observation, action or reward is not finite.
             HubRefusalError: It is to be downloaded, and has no such version.
         """
-        check_dataset(self.repo_id, self.root)
+        check_dataset(self.repo_id, self.root, self.revision)
         check_dataset_version(self.repo_id, self.root, self.revision)
-        with damage_named(self.repo_id, self.root):
+        with damage_named(self.repo_id, self.root, self.revision):
             dataset = LeRobotDataset(self.repo_id, root=self.root, revision=self.revision)
         check_finite_dataset(dataset)
         return dataset

@@ -127,14 +127,14 @@ def _train(cfg: TrainPipelineConfig, accelerator: RamAccelerator) -> None:
         check_latents_are_there(cfg)
     if cfg.resume and accelerator.is_main_process:
         clear_unfinished(cfg.checkpoint_path, cfg.output_dir)
-    check_dataset(cfg.dataset.repo_id, cfg.dataset.root)
+    check_dataset(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     check_dataset_version(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     with accelerator.in_turn():
         encode_if_needed(cfg)
     log = TrainLog(cfg.output_dir)
     logging.getLogger().addFilter(log)
     try:
-        with damage_named(cfg.dataset.repo_id, cfg.dataset.root):
+        with damage_named(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision):
             lerobot_train(cfg, accelerator=accelerator)
     finally:
         logging.getLogger().removeFilter(log)
