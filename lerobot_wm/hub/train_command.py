@@ -1,32 +1,73 @@
 """The command that trains a policy as a run did, read from the run's configuration."""
 
 import json
+import re
 import shlex
-from dataclasses import fields
+from dataclasses import MISSING, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import draccus
+from draccus import cfgparsing
+from huggingface_hub.errors import HFValidationError
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_wm.data.latents import LatentRecord
 
-# Filled in when a policy is made, from its dataset or its world model; or of the machine.
-_NOT_CHOSEN = {
-    "tasks",
-    "image_key",
-    "rssm.image_channels",
-    "rssm.action_dim",
-    "rssm.proprio_dim",
-    "rssm.predict_reward",
-    "world_model_fingerprint",
-    "trained_betas",
-    "normalization_mapping",
-    "dtype",
+# Filled in when a policy is made, from its dataset, its world model or its checkpoint.
+_FILLED_IN = {
+    "policy.input_features",
+    "policy.output_features",
+    "policy.use_peft",
+    "policy.tasks",
+    "policy.rssm.image_channels",
+    "policy.rssm.action_dim",
+    "policy.rssm.proprio_dim",
+    "policy.rssm.centred_start",
+    "policy.world_model",
+    "policy.world_model_fingerprint",
+    "policy.trained_betas",
 }
-# Of every policy: the Hub's settings and the machine's, not the method's.
-_INHERITED = {field.name for field in fields(PreTrainedConfig)}
+# The machine's, the Hub's, and what is noted, kept and evaluated on the way: not of what is learned.
+_NO_MATTER = {
+    "policy.device",
+    "policy.push_to_hub",
+    "policy.repo_id",
+    "policy.private",
+    "policy.tags",
+    "policy.license",
+    "dataset.root",
+    "dataset.video_backend",
+    "output_dir",
+    "job_name",
+    "job",
+    "resume",
+    "num_workers",
+    "prefetch_factor",
+    "persistent_workers",
+    "dataloader_multiprocessing_context",
+    "env",
+    "env_eval_freq",
+    "eval",
+    "log_freq",
+    "save_checkpoint",
+    "save_checkpoint_to_hub",
+    "save_freq",
+    "wandb",
+}
+_OF_THEIR_OWN = {  # written by `train_command` and `_policy_flags`
+    "policy",
+    "policy.pretrained_path",
+    "policy.pretrained_revision",
+    "dataset",
+    "use_policy_training_preset",
+    "optimizer",
+    "scheduler",
+}
+_LEFT_OUT = _FILLED_IN | _NO_MATTER | _OF_THEIR_OWN
+_ALWAYS = ("batch_size", "steps", "seed")  # also at their defaults
 
 
 def train_command(cfg: TrainPipelineConfig, latents: LatentRecord | None) -> str:
@@ -38,66 +79,88 @@ def train_command(cfg: TrainPipelineConfig, latents: LatentRecord | None) -> str
         cfg: Of the run; it trained a policy.
         latents: Of its dataset, where that holds latents: the command encodes their source.
     """
-    flags: dict[str, object] = {}
-    # A run that is gone on with loads its own checkpoint.
-    if cfg.policy.pretrained_path is None or cfg.resume:
-        flags["policy.type"] = cfg.policy.type
-    else:
-        flags["policy.path"] = _public(cfg.policy.pretrained_path, "CHECKPOINT")
-        if cfg.policy.pretrained_revision is not None:
-            flags["policy.pretrained_revision"] = cfg.policy.pretrained_revision
-    flags |= _policy_flags(cfg.policy)
-    cameras = getattr(cfg.policy, "image_key", None)
-    # Those of a policy on latents are its world model's; all that there are need not be named.
-    if (
-        cameras
-        and not hasattr(cfg.policy, "world_model_path")
-        and cameras != ",".join(cfg.policy.image_features)
-    ):
-        flags["policy.image_key"] = cameras
-    if cfg.rename_map:
-        flags["rename_map"] = json.dumps(cfg.rename_map)
-    flags["dataset.repo_id"] = cfg.dataset.repo_id if latents is None else latents.source_repo_id
-    if cfg.dataset.revision is not None and latents is None:
-        flags["dataset.revision"] = cfg.dataset.revision
-    if cfg.dataset.episodes is not None:
-        flags["dataset.episodes"] = cfg.dataset.episodes
-    flags |= {"batch_size": cfg.batch_size, "steps": cfg.steps, "seed": cfg.seed}
+    flags = _policy_flags(cfg.policy, cfg.resume)
+    dataset = cfg.dataset
+    if latents is not None:
+        dataset = replace(dataset, repo_id=latents.source_repo_id, revision=None)
+    flags |= _changed(dataset, vars(DatasetConfig(repo_id="")), "dataset.")
+    if not cfg.use_policy_training_preset:
+        flags["use_policy_training_preset"] = False
+        for name, setting in {"optimizer": cfg.optimizer, "scheduler": cfg.scheduler}.items():
+            flags |= {f"{name}.type": setting.type, **_changed(setting, {}, f"{name}.")}
+    usual = {name: value for name, value in _defaults(TrainPipelineConfig).items() if name not in _ALWAYS}
+    flags |= _changed(cfg, usual)
+    flags["policy.push_to_hub"] = False  # LeRobot pushes by default, and wants to know where
     return " ".join(
         ["lerobot-wm train", *(shlex.quote(f"--{key}={_text(value)}") for key, value in flags.items())]
     )
 
 
-def _policy_flags(policy: PreTrainedConfig) -> dict[str, object]:
-    """The policy's own settings that are not at their defaults."""
-    chosen, default = draccus.encode(policy), draccus.encode(type(policy)(device=policy.device))
-    flat, flat_default = _flatten(chosen), _flatten(default)
-    flags = {
-        f"policy.{key}": value
-        for key, value in flat.items()
-        if key in flat_default and value != flat_default[key] and key.split(".")[0] not in _INHERITED
-    }
-    flags = {key: value for key, value in flags.items() if key.removeprefix("policy.") not in _NOT_CHOSEN}
-    if "policy.world_model_path" in flags:
-        flags["policy.world_model_path"] = _public(str(flags["policy.world_model_path"]), "WORLD_MODEL")
+def _policy_flags(policy: PreTrainedConfig, resumed: bool) -> dict[str, object]:
+    """The policy's type or checkpoint, and its own settings that are not at their defaults there."""
+    # A run that is gone on with loads its own checkpoint.
+    if policy.pretrained_path is None or resumed:
+        flags = {"policy.type": policy.type, **_changed(policy, _defaults(type(policy)), "policy.")}
+    else:
+        flags = {"policy.path": _public(policy.pretrained_path, "CHECKPOINT")}
+        if policy.pretrained_revision is not None:
+            flags["policy.pretrained_revision"] = policy.pretrained_revision
+        flags |= _changed(policy, _settings_of_checkpoint(policy), "policy.")
+        flags.pop("policy.world_model_path", None)  # it is in the checkpoint, and no other is taken
+    if hasattr(policy, "world_model_path"):
+        flags.pop("policy.image_key", None)  # its world model's
     return flags
 
 
+def _settings_of_checkpoint(policy: PreTrainedConfig) -> dict[str, Any]:
+    """The settings of the checkpoint that a policy was trained on from; none where that is no longer here."""
+    try:
+        return vars(
+            PreTrainedConfig.from_pretrained(
+                policy.pretrained_path, revision=policy.pretrained_revision, local_files_only=True
+            )
+        )
+    except (FileNotFoundError, HFValidationError):
+        return {}
+
+
+def _changed(config: Any, usual: dict[str, Any], prefix: str = "") -> dict[str, object]:
+    """Settings that are unlike the usual ones or have no usual value, under dotted names."""
+    flags: dict[str, object] = {}
+    for item in fields(config):
+        key, value = prefix + item.name, getattr(config, item.name)
+        if not item.init or key in _LEFT_OUT:
+            continue
+        if is_dataclass(value):
+            known = usual.get(item.name)
+            flags |= _changed(value, {} if known is None else vars(known), f"{key}.")
+        elif item.name not in usual or draccus.encode(value) != draccus.encode(usual[item.name]):
+            is_place = item.name.endswith("_path") and value is not None
+            flags[key] = _public(value, item.name.removesuffix("_path").upper()) if is_place else value
+    return flags
+
+
+def _defaults(kind: type) -> dict[str, Any]:
+    """Defaults of a configuration's settings; an object of it may have filled in what fits this machine."""
+    defaults = {}
+    for item in fields(kind):
+        if item.default is not MISSING:
+            defaults[item.name] = item.default
+        elif item.default_factory is not MISSING:
+            defaults[item.name] = item.default_factory()
+    return defaults
+
+
 def _public(path: str | Path, name: str) -> str:
-    """A Hub id as it is; a name in place of a folder."""
-    return name if Path(path).exists() else str(path)
-
-
-def _flatten(settings: dict[str, Any], prefix: str = "") -> dict[str, object]:
-    """Nested settings under dotted names."""
-    flat: dict[str, object] = {}
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat
+    """A Hub id, user/name or user/name@revision, as it is; a name in place of a folder."""
+    is_hub_id = re.fullmatch(r"[\w-][\w.-]*/[\w.-]+(@.+)?", str(path)) is not None
+    return str(path) if is_hub_id and not Path(path).exists() else name
 
 
 def _text(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    """A value as draccus reads it from the command line."""
+    if isinstance(value, str):
+        is_plain = re.fullmatch(r"([A-Za-z]|[0-9a-f]{40})[\w./@,-]*", value) is not None
+        if is_plain and cfgparsing.parse_string(value) == value:  # not null, yes or the like
+            return value
+    return json.dumps(draccus.encode(value))

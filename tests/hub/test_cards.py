@@ -1,9 +1,5 @@
 """Cards hold what they are given, whatever it is named."""
 
-import json
-import shlex
-from pathlib import Path
-
 import pytest
 from huggingface_hub import ModelCard
 from lerobot.configs import FeatureType, PolicyFeature
@@ -13,12 +9,10 @@ from lerobot.policies.factory import get_policy_class
 from markdown_it import MarkdownIt
 
 from lerobot_wm.constants import MT6
-from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.hub.eval_command import eval_command
 from lerobot_wm.hub.markdown import code, escaped
 from lerobot_wm.hub.model_card import TrainingData, model_card
-from lerobot_wm.hub.train_command import train_command
 from lerobot_wm.pipeline.publish import check_records
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
@@ -79,49 +73,6 @@ def test_no_name_breaks_a_card() -> None:
 
 def features(kind: str, key: str, shape: tuple[int, ...]) -> dict:
     return {key: PolicyFeature(FeatureType[kind], shape)}
-
-
-def test_the_command_trains_the_same_and_tells_no_place(tmp_path: Path) -> None:
-    policy = WMBCConfig(
-        device="cpu", world_model_path=str(tmp_path), dropout=0.3, hidden_dims=[64], tasks=NASTY
-    )
-    policy.world_model_fingerprint, policy.repo_id = "abc", "user/wm_bc"
-    run = TrainPipelineConfig(
-        dataset=DatasetConfig(repo_id="user/latents", root=str(tmp_path), revision="v1"),
-        policy=policy,
-        output_dir=tmp_path,
-        batch_size=7,
-        steps=11,
-        seed=5,
-    )
-    command = train_command(run, None)
-    assert command == (
-        "lerobot-wm train --policy.type=wm_bc '--policy.hidden_dims=[64]' --policy.dropout=0.3 "
-        "--policy.world_model_path=WORLD_MODEL --dataset.repo_id=user/latents --dataset.revision=v1 "
-        "--batch_size=7 --steps=11 --seed=5"
-    )
-    source = LatentRecord("abc", "user/images", "def", NASTY, False)
-    assert "--dataset.repo_id=user/images --batch_size" in train_command(run, source)
-    policy.world_model_path, policy.pretrained_path = "user/wm@v1", tmp_path
-    assert "--policy.world_model_path=user/wm@v1" in train_command(run, None)
-    assert train_command(run, None).startswith("lerobot-wm train --policy.path=CHECKPOINT ")
-    run.resume = True
-    assert train_command(run, None).startswith("lerobot-wm train --policy.type=wm_bc ")
-
-
-def test_the_command_chooses_the_same_cameras(tmp_path: Path) -> None:
-    front, wrist = "observation.images.front", "observation.images.wrist"
-    policy = WMRSSMConfig(device="cpu", image_key=f"{front},{wrist}")
-    policy.input_features = features("VISUAL", front, (3, 8, 8)) | features("VISUAL", wrist, (3, 8, 8))
-    run = TrainPipelineConfig(dataset=DatasetConfig(repo_id="user/x"), policy=policy, output_dir=tmp_path)
-    assert "image_key" not in train_command(run, None)
-    assert "rename_map" not in train_command(run, None)
-    for chosen in (wrist, f"{wrist},{front}"):
-        policy.image_key = chosen
-        assert f" --policy.image_key={chosen} " in train_command(run, None)
-    run.rename_map = {"observation.images.top": front}
-    [flag] = [word for word in shlex.split(train_command(run, None)) if "rename_map" in word]
-    assert json.loads(flag.removeprefix("--rename_map=")) == run.rename_map
 
 
 REACH, DOOR = "Reach a goal position", "Open a door with a revolving joint"
