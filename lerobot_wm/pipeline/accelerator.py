@@ -19,6 +19,8 @@ from lerobot_wm.data.loader import RamLoader
 from lerobot_wm.data.order import batches_of_rows
 from lerobot_wm.pipeline.divergence import LossWatch
 from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.features import names_before
+from lerobot_wm.policies.fine_tuning import fit_cameras
 
 # How long processes wait for the one that decodes or encodes; by default they give up after minutes.
 _PATIENCE = timedelta(days=1)
@@ -85,8 +87,12 @@ class RamAccelerator(Accelerator):
         batch_sampler = batches_of_rows(data_loader)
         if self.num_processes > 1:
             batch_sampler = BatchSamplerShard(batch_sampler, self.num_processes, self.process_index)
+        cfg = self._train_config
+        if cfg.rename_map and isinstance(cfg.policy, ImagePolicyConfig) and not self._loaders:
+            # LeRobot has made the policy and did not tell it the new names of the training data's cameras.
+            fit_cameras(cfg.policy, data_loader.dataset.meta, cfg.rename_map)
         with self.in_turn():  # the first decodes the frames, the others map them
-            loader = RamLoader(data_loader, batch_sampler, self.device, cameras_to_serve(self._train_config))
+            loader = RamLoader(data_loader, batch_sampler, self.device, cameras_to_serve(cfg))
         self._loaders.append(loader)
         return loader
 
@@ -112,8 +118,8 @@ def cameras_to_serve(cfg: TrainPipelineConfig) -> dict[str, tuple[int, int]] | N
     policy = cfg.policy
     if not isinstance(policy, ImagePolicyConfig):
         return None
-    names_in_dataset = {renamed: key for key, renamed in cfg.rename_map.items()}
-    return {names_in_dataset.get(key, key): policy.image_size for key in policy.cameras}
+    cameras = names_before(policy.cameras, cfg.rename_map)
+    return dict.fromkeys(cameras, policy.image_size) if cameras else {}  # without one there is no size
 
 
 def make_accelerator(cfg: TrainPipelineConfig) -> RamAccelerator:

@@ -3,9 +3,12 @@
 A frozen image backbone may stand in its place: its latents are the pooled features of each frame.
 """
 
+import json
 import logging
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import draccus
 from lerobot.datasets.compute_stats import get_feature_stats
@@ -29,6 +32,7 @@ from lerobot_wm.pipeline.encode_episodes import episode_batches
 from lerobot_wm.pipeline.encode_parts import LatentParts
 from lerobot_wm.pipeline.quiet import quiet
 from lerobot_wm.pipeline.share import Share, parts_folder, refuse_difference
+from lerobot_wm.policies.features import OWN_NAMES, names_before, renamed
 from lerobot_wm.policies.fits import check_encoder_fits
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_encoder import EncoderPolicy, encoder_fingerprint, load_encoder
@@ -44,6 +48,7 @@ def encode(
     output_repo_id: str,
     output_root: Path,
     *,
+    rename_map: Mapping[str, str] = OWN_NAMES,
     sample_seed: int | None = None,
 ) -> LeRobotDataset:
     """Write a copy of `source` with `observation.latent` (L,) in place of its cameras.
@@ -57,6 +62,7 @@ def encode(
         source: The image dataset, all of its episodes.
         output_repo_id: Repository id of the result.
         output_root: Folder of the result.
+        rename_map: The names that the world model knows the source's features by, where they are others.
         sample_seed: Store a sample of z_t, drawn with this seed, instead of its mean.
 
     Returns:
@@ -67,9 +73,9 @@ def encode(
         ValueError: The dataset lacks a camera of the world model or proprioception, or has actions of another size
             than it was trained with, or latents are not finite.
     """
-    record, parts = _begin(policy, source, output_root, sample_seed)
+    record, parts = _begin(policy, source, output_root, rename_map, sample_seed)
     batches = episode_batches(source)
-    parts.complete(policy, source, batches, sample_seed)
+    parts.complete(policy, source, batches, rename_map, sample_seed)
     latents = parts.read(batches).numpy()  # (N, L), in the dataset's order
     partial = output_root.with_name(f"{output_root.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -92,15 +98,16 @@ def encode_share(
     output_root: Path,
     share: Share,
     *,
+    rename_map: Mapping[str, str] = OWN_NAMES,
     sample_seed: int | None = None,
 ) -> None:
     """One job's share of the latents, in `<output_root>.parts`; `encode` turns those of all jobs into a dataset.
 
     Raises what `encode` does, and ValueError where there are more jobs than batches.
     """
-    _, parts = _begin(policy, source, output_root, sample_seed)
+    _, parts = _begin(policy, source, output_root, rename_map, sample_seed)
     batches = episode_batches(source)
-    parts.complete(policy, source, share.of(batches), sample_seed)
+    parts.complete(policy, source, share.of(batches), rename_map, sample_seed)
     there = len(batches) - len(parts.missing(batches))
     print(
         f"Job {share.index}/{share.count} is done: {there} of {len(batches)} batches are in {parts.folder}. "
@@ -109,30 +116,40 @@ def encode_share(
 
 
 def _begin(
-    policy: EncoderPolicy, source: LeRobotDataset, output_root: Path, sample_seed: int | None
+    policy: EncoderPolicy,
+    source: LeRobotDataset,
+    output_root: Path,
+    rename_map: Mapping[str, str],
+    sample_seed: int | None,
 ) -> tuple[LatentRecord, LatentParts]:
     """Refuse what cannot be encoded; the record of the result, and the place of its latents."""
     parts = parts_folder(output_root)
     if output_root.exists():
         shutil.rmtree(parts, ignore_errors=True)  # left by a run killed at its very end
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
-    missing = [key for key in policy.config.cameras if key not in source.meta.camera_keys]
+    cameras = names_before(policy.config.cameras, rename_map)
+    missing = [key for key in cameras if key not in source.meta.camera_keys]
     if missing:
         raise ValueError(
             f"The world model watches {', '.join(missing)}; {source.repo_id} has the cameras "
-            f"{', '.join(source.meta.camera_keys) or 'none'}: use a dataset with all it watches."
+            f"{', '.join(source.meta.camera_keys) or 'none'}: use a dataset with all it watches, or give these names "
+            "to cameras that show the same, by --rename_map."
         )
-    if OBS_STATE not in source.meta.features:
+    [state] = names_before([OBS_STATE], rename_map)
+    if state not in source.meta.features:
         raise ValueError(
-            f"{source.repo_id} has no '{OBS_STATE}', which every policy on latents reads beside them."
+            f"{source.repo_id} has no '{state}', which every policy on latents reads beside them."
         )
-    check_encoder_fits(policy.config, source.meta)
-    record = _record(policy, source, sample_seed)
-    return record, LatentParts(parts, record.made_of)
+    check_encoder_fits(policy.config, source.meta, rename_map)
+    record = _record(policy, source, rename_map, sample_seed)
+    names = {"rename_map": json.dumps(dict(rename_map), sort_keys=True)}
+    return record, LatentParts(parts, record.made_of | names)
 
 
-def _record(policy: EncoderPolicy, source: LeRobotDataset, sample_seed: int | None) -> LatentRecord:
-    features = dataset_to_policy_features(source.meta.features)
+def _record(
+    policy: EncoderPolicy, source: LeRobotDataset, rename_map: Mapping[str, str], sample_seed: int | None
+) -> LatentRecord:
+    features = renamed(dataset_to_policy_features(source.meta.features), rename_map)
     return LatentRecord(
         world_model_fingerprint=encoder_fingerprint(policy.world_model),
         source_repo_id=source.repo_id,
@@ -144,7 +161,13 @@ def _record(policy: EncoderPolicy, source: LeRobotDataset, sample_seed: int | No
     )
 
 
-def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMetadata, device: str) -> Path:
+def encode_to_cache(
+    world_model_path: str,
+    repo_id: str,
+    meta: LeRobotDatasetMetadata,
+    device: str,
+    rename_map: Mapping[str, str] = OWN_NAMES,
+) -> Path:
     """Encode a dataset once for a world model; a second call finds the first one's result.
 
     Args:
@@ -152,6 +175,7 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
         repo_id: The image dataset's repository id.
         meta: Its metadata.
         device: Where to run the world model.
+        rename_map: See `encode`.
 
     Returns:
         Folder of the latent dataset, in the image dataset's cache.
@@ -164,7 +188,8 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
         source = LeRobotDataset(repo_id, revision=root.name)
     else:
         source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
-    fingerprint = encoder_fingerprint(policy.world_model, cameras=policy.config.cameras)
+    names: dict[str, Any] = {"rename_map": sorted(rename_map.items())} if rename_map else {}
+    fingerprint = encoder_fingerprint(policy.world_model, cameras=policy.config.cameras, **names)
     name = f"{LATENTS_PREFIX}{fingerprint}-{dataset_fingerprint(root)}"
     output_root = cache_root(root) / name
     with sole_writer(output_root, wait=True):  # another training may be encoding it
@@ -172,7 +197,7 @@ def encode_to_cache(world_model_path: str, repo_id: str, meta: LeRobotDatasetMet
             logger.info("Latents found in %s", output_root)
         else:
             logger.info("Encoding %s into %s", repo_id, output_root)
-            encode(policy, source, f"{repo_id}_latents", output_root)
+            encode(policy, source, f"{repo_id}_latents", output_root, rename_map=rename_map)
     return output_root
 
 
@@ -201,13 +226,26 @@ def _run(cfg: EncodeConfig) -> None:
     source = cfg.dataset.open()
     sample_seed = cfg.seed if cfg.sample else None
     if share is not None:
-        encode_share(policy, source, cfg.output_root, share, sample_seed=sample_seed)
+        encode_share(
+            policy, source, cfg.output_root, share, rename_map=cfg.rename_map, sample_seed=sample_seed
+        )
         return
     if cfg.push_to_hub and cfg.output_root.exists():  # a push that did not finish is begun again
-        _check_same(LatentRecord.read(cfg.output_root), _record(policy, source, sample_seed), cfg.output_root)
+        _check_same(
+            LatentRecord.read(cfg.output_root),
+            _record(policy, source, cfg.rename_map, sample_seed),
+            cfg.output_root,
+        )
         dataset = LeRobotDataset(cfg.output_repo_id, root=cfg.output_root)
     else:
-        dataset = encode(policy, source, cfg.output_repo_id, cfg.output_root, sample_seed=sample_seed)
+        dataset = encode(
+            policy,
+            source,
+            cfg.output_repo_id,
+            cfg.output_root,
+            rename_map=cfg.rename_map,
+            sample_seed=sample_seed,
+        )
     print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames -> {cfg.output_root}")
     if cfg.push_to_hub:
         record = LatentRecord.read(cfg.output_root)

@@ -1,6 +1,6 @@
 """Flags of `lerobot-wm encode`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_wm.pipeline.source import SourceConfig
@@ -18,6 +18,8 @@ class EncodeConfig:
         output_root: Its folder; must not exist yet.
         sample: Store a sample of z_t instead of its mean.
         seed: Seed of the samples.
+        rename_map: The names that the world model knows the dataset's cameras and proprioception by, where they are
+            others, as in `lerobot-train`. What the latent dataset keeps of these has the dataset's own names.
         device: Where to run the world model; None picks the fastest there is.
         shard: Of several jobs, the one this is: 1/4 is the first of four. Each job encodes its share of the episodes
             into `<output_root>.parts`; when all are in one such folder, the same command without this flag makes the
@@ -34,6 +36,7 @@ class EncodeConfig:
     output_root: Path
     sample: bool = False
     seed: int = 0
+    rename_map: dict[str, str] = field(default_factory=dict)
     device: str | None = None
     shard: str | None = None
     push_to_hub: bool = False

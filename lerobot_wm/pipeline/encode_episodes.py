@@ -1,6 +1,6 @@
 """Whole episodes through a frozen encoder, a batch of a few at a time."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.tables import column_tensor
 from lerobot_wm.policies.cameras import stack_images
+from lerobot_wm.policies.features import OWN_NAMES, names_before
 from lerobot_wm.policies.frozen_encoder import EncoderPolicy
 
 _EPISODES_PER_BATCH = 16
@@ -26,7 +27,12 @@ def episode_batches(dataset: LeRobotDataset) -> list[range]:
 
 @torch.no_grad()
 def filter_batches(
-    policy: EncoderPolicy, source: LeRobotDataset, batches: Sequence[range], *, sample_seed: int | None = None
+    policy: EncoderPolicy,
+    source: LeRobotDataset,
+    batches: Sequence[range],
+    *,
+    rename_map: Mapping[str, str] = OWN_NAMES,
+    sample_seed: int | None = None,
 ) -> Iterator[Tensor]:
     """Latents of some batches of a dataset's episodes; no other episode's images are decoded.
 
@@ -34,6 +40,7 @@ def filter_batches(
         policy: The world model, on the device it shall run on.
         source: The image dataset it filters.
         batches: Some of its `episode_batches`, in their order.
+        rename_map: The names that the world model knows the dataset's features by, where they are others.
         sample_seed: Draw z_t, with this seed, instead of taking its mean.
 
     Yields:
@@ -45,13 +52,14 @@ def filter_batches(
     episodes = [episode for batch in batches for episode in batch]
     dataset = LeRobotDataset(source.repo_id, source.root, episodes, revision=source.revision)
     # Of each camera (N, H, W, C) uint8, by absolute index; the files that training reads.
-    cameras = [camera_frames(dataset, key, image_size) for key in policy.config.cameras]
+    camera_keys = names_before(policy.config.cameras, rename_map)
+    cameras = [camera_frames(dataset, key, image_size) for key in camera_keys]
     all_lengths = source.meta.episodes["length"][:]
     lengths = [all_lengths[episode] for episode in episodes]
     # Of each episode, its rows of a column.
     index, actions, proprio = (
         dict(zip(episodes, _column(dataset, key).split(lengths), strict=True))
-        for key in ("index", ACTION, OBS_STATE)
+        for key in ("index", ACTION, *names_before([OBS_STATE], rename_map))
     )
     for batch in batches:
         embeds = []

@@ -3,7 +3,7 @@
 So several jobs can share the work, and a killed one goes on where it was.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,7 +44,12 @@ class LatentParts:
         return [batch for batch in batches if not self._path(batch).exists()]
 
     def complete(
-        self, policy: EncoderPolicy, source: LeRobotDataset, batches: Sequence[range], sample_seed: int | None
+        self,
+        policy: EncoderPolicy,
+        source: LeRobotDataset,
+        batches: Sequence[range],
+        rename_map: Mapping[str, str],
+        sample_seed: int | None,
     ) -> None:
         """Encode those of the batches that are not here, see `filter_batches`; a file appears when it is whole.
 
@@ -60,7 +65,7 @@ class LatentParts:
         self.folder.mkdir(parents=True, exist_ok=True)
         first_frames = source.meta.episodes["dataset_from_index"]
         with tqdm(total=sum(map(len, missing)), desc="Encoding", unit="episode") as bar:
-            parts = filter_batches(policy, source, missing, sample_seed=sample_seed)
+            parts = filter_batches(policy, source, missing, rename_map=rename_map, sample_seed=sample_seed)
             for batch, latents in zip(missing, parts, strict=True):
                 finite = latents.isfinite().all(dim=1)  # (N,)
                 if not finite.all():

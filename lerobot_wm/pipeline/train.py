@@ -71,7 +71,7 @@ def encode_if_needed(cfg: TrainPipelineConfig) -> None:
     if encoder is None:
         return
     if OBS_LATENT not in meta.features:
-        encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device))
+        encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device), cfg.rename_map)
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None
 
@@ -85,10 +85,12 @@ def check_latents_are_there(cfg: TrainPipelineConfig) -> None:
     root = Path(cfg.dataset.root or ".")
     if root.exists() or not root.name.startswith(LATENTS_PREFIX):
         return
+    rename_map = f" --rename_map='{json.dumps(cfg.rename_map)}'" if cfg.rename_map else ""
     raise FileNotFoundError(
         f"{root} is gone, the latents that this training reads. To go on, make them again: lerobot-wm encode "
         f"--world_model_path={cfg.checkpoint_path / PRETRAINED_MODEL_DIR} --dataset.repo_id=... --dataset.root=... "
-        f"--output_repo_id={cfg.dataset.repo_id} --output_root={root}, with the dataset of images as --dataset."
+        f"--output_repo_id={cfg.dataset.repo_id} --output_root={root}{rename_map}, with the dataset of images as "
+        "--dataset."
     )
 
 

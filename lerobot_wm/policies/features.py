@@ -1,5 +1,7 @@
-"""What the policy configurations share: precision, and reading sizes from LeRobot's features."""
+"""What the policy configurations share: precision, and reading names and sizes from LeRobot's features."""
 
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -11,6 +13,8 @@ from torch import Tensor
 IDENTITY_NORMALIZATION: dict[str, NormalizationMode] = dict.fromkeys(
     ("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
 )
+
+OWN_NAMES: Mapping[str, str] = MappingProxyType({})  # the rename_map of a dataset whose names hold
 
 
 def default_dtype(device: str) -> str:
@@ -52,6 +56,18 @@ def feature_dim(features: dict[str, PolicyFeature], key: str, where: str) -> int
 def image_keys(features: dict[str, PolicyFeature]) -> list[str]:
     """The camera keys among the features, in order."""
     return [key for key, feature in features.items() if feature.type is FeatureType.VISUAL]
+
+
+def renamed(features: Mapping[str, PolicyFeature], rename_map: Mapping[str, str]) -> dict[str, PolicyFeature]:
+    """The features of a dataset or environment under the names that `--rename_map` gives them."""
+    kept = {key: feature for key, feature in features.items() if key not in rename_map}
+    return kept | {new: features[old] for old, new in rename_map.items() if old in features}
+
+
+def names_before(keys: Iterable[str], rename_map: Mapping[str, str]) -> list[str]:
+    """What the features of these names are called in the dataset itself, which `--rename_map` leaves as it is."""
+    before = {new: old for old, new in rename_map.items()}
+    return [before.get(key, key) for key in keys]
 
 
 def stat(dataset_stats: dict[str, dict[str, Any]] | None, key: str, name: str) -> Tensor:

@@ -1,19 +1,23 @@
 """Training that goes on from a checkpoint, on the same dataset or another one."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
-from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import ACTION
 from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.features import image_keys, renamed
 from lerobot_wm.policies.iql_config import IQLConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
 
 def fit_to_dataset(
-    config: ImagePolicyConfig, saved: ImagePolicyConfig, dataset_meta: LeRobotDatasetMetadata
+    config: ImagePolicyConfig,
+    saved: ImagePolicyConfig,
+    dataset_meta: LeRobotDatasetMetadata,
+    rename_map: Mapping[str, str],
 ) -> None:
     """Check that a checkpoint can be trained on a dataset, and have it expect the dataset's cameras.
 
@@ -24,6 +28,8 @@ def fit_to_dataset(
         config: The configuration to train with; changed in place. LeRobot has given it the dataset's actions.
         saved: As it is in the checkpoint.
         dataset_meta: The dataset to train on.
+        rename_map: New names of its features, where they are known. Cameras of one size need none: LeRobot's own
+            training tells a policy of no names.
 
     Raises:
         ValueError: A size differs; names both.
@@ -32,31 +38,48 @@ def fit_to_dataset(
         saved,
         (*saved.features_read, ACTION),
         dataset_meta,
+        rename_map,
         f"train it on with data of the same robot, or train anew with --policy.type={saved.type} in place of "
         "--policy.path",
     )
     features = dataset_to_policy_features(dataset_meta.features)
-    for key in set(saved.cameras) & features.keys():  # a latent dataset has none
+    shapes = {features[key].shape for key in image_keys(features)}  # none of a latent dataset
+    if len(shapes) == 1:
+        config.input_features |= {key: PolicyFeature(FeatureType.VISUAL, *shapes) for key in saved.cameras}
+    fit_cameras(config, dataset_meta, rename_map)
+
+
+def fit_cameras(
+    config: ImagePolicyConfig, dataset_meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]
+) -> None:
+    """Have a policy expect its cameras in the size that they have in a dataset, as far as they are found there."""
+    features = renamed(dataset_to_policy_features(dataset_meta.features), rename_map)
+    for key in set(config.cameras) & features.keys():
         config.input_features[key] = features[key]
 
 
 def check_sizes(
-    saved: ImagePolicyConfig, keys: Iterable[str], dataset_meta: LeRobotDatasetMetadata, mend: str
+    saved: ImagePolicyConfig,
+    keys: Iterable[str],
+    dataset_meta: LeRobotDatasetMetadata,
+    rename_map: Mapping[str, str],
+    mend: str,
 ) -> None:
     """Refuse a dataset whose numbers are of other sizes than those a checkpoint was trained with.
 
-    A feature that the dataset lacks, or has under another name (--rename_map), is passed over, and so are images.
+    A feature that the dataset lacks is passed over, and so are images.
 
     Args:
         saved: The checkpoint's configuration.
         keys: Of the features to compare.
         dataset_meta: The dataset's.
+        rename_map: New names of its features, where they are known.
         mend: What to do, for the message.
 
     Raises:
         ValueError: A size differs; names both.
     """
-    features = dataset_to_policy_features(dataset_meta.features)
+    features = renamed(dataset_to_policy_features(dataset_meta.features), rename_map)
     for key in filter(features.__contains__, keys):
         known = (saved.output_features if key == ACTION else saved.input_features)[key]
         found = features[key]

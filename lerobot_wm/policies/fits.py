@@ -1,6 +1,6 @@
 """What must fit before work starts: a policy, and the dataset or environment it is to be used with."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from copy import deepcopy
 
 import torch
@@ -14,6 +14,7 @@ from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.tasks import resolve_tasks, task_description
 from lerobot_wm.policies.cameras import ImagePolicyConfig, check_observation
 from lerobot_wm.policies.checkpoint import read_config
+from lerobot_wm.policies.features import names_before, renamed
 from lerobot_wm.policies.fine_tuning import check_kept, check_sizes, fit_to_dataset
 from lerobot_wm.policies.iql_agent import end_column
 from lerobot_wm.policies.iql_config import IQLConfig
@@ -48,15 +49,18 @@ def check_dataset_fits(
     if OBS_LATENT not in dataset_meta.features:
         cameras = [rename_map.get(key, key) for key in dataset_meta.camera_keys]
         _check_cameras(saved, cameras, dataset_meta.repo_id)
-    fit_to_dataset(deepcopy(config), saved, dataset_meta)
+    fit_to_dataset(deepcopy(config), saved, dataset_meta, rename_map)
 
 
-def check_encoder_fits(config: ImagePolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> None:
+def check_encoder_fits(
+    config: ImagePolicyConfig, dataset_meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]
+) -> None:
     """Refuse to encode a dataset without the numbers that a world model reads, or with them in another size.
 
     Args:
         config: Of the world model, or of a policy on its latents.
         dataset_meta: Of the dataset of images.
+        rename_map: New names of its features.
 
     Raises:
         ValueError: A feature is missing or of another size than in training.
@@ -65,7 +69,7 @@ def check_encoder_fits(config: ImagePolicyConfig, dataset_meta: LeRobotDatasetMe
     assert isinstance(model, WorldModelConfig)  # `load_encoder` takes nothing else
     keys = [key for key in model.features_read if key not in model.cameras]
     keys += [] if model.action_dim is None else [ACTION]
-    missing = [key for key in keys if key not in dataset_meta.features]
+    missing = [key for key in names_before(keys, rename_map) if key not in dataset_meta.features]
     if missing:
         raise ValueError(
             f"{dataset_meta.repo_id} has no {', '.join(missing)}, which the world model reads; it has "
@@ -75,6 +79,7 @@ def check_encoder_fits(config: ImagePolicyConfig, dataset_meta: LeRobotDatasetMe
         model,
         keys,
         dataset_meta,
+        rename_map,
         "encode data of the same robot, or train another world model on this dataset",
     )
 
@@ -99,7 +104,7 @@ def check_environment_fits(config: PreTrainedConfig, env: EnvConfig, rename_map:
         )
     if not isinstance(config, ImagePolicyConfig):
         return
-    features = {rename_map.get(key, key): feature for key, feature in env_to_policy_features(env).items()}
+    features = renamed(env_to_policy_features(env), rename_map)
     visual = [key for key, feature in features.items() if feature.type is FeatureType.VISUAL]
     if not isinstance(env, MetaworldMTEnvConfig):
         if not set(visual) <= set(config.cameras):  # some declare fewer than they show

@@ -322,3 +322,86 @@ def test_iql_goes_on_with_a_renamed_state(
         f'--rename_map={{"observation.joints":"observation.state"}} --output_dir={tmp_path / "run"}',
     )
     assert load(tmp_path / "run" / CHECKPOINT).config.tasks == ["Reach", "Push", "Wave"]
+
+
+RENAMED = {
+    FRONT: "observation.images.a",
+    WRIST: "observation.images.b",
+    "observation.state": "observation.joints",
+}
+SWAPPED = {FRONT: WRIST, WRIST: FRONT}
+
+
+def record_renamed(root: Path, names: dict[str, str]) -> tuple[LeRobotDataset, str]:
+    """The other dataset under other names, and the flag that gives its features the checkpoints' names."""
+    named = {names.get(key, key): feature for key, feature in {**features((60, 40)), **REWARDS}.items()}
+    dataset = record(root, named, [("Wave", 5), ("Push", 9)])
+    return dataset, f"--rename_map={json.dumps({new: old for old, new in names.items()}).replace(' ', '')}"
+
+
+@pytest.mark.parametrize("names", [RENAMED, SWAPPED], ids=["renamed", "swapped"])
+@pytest.mark.parametrize("policy_type", ["wm_rssm", "wm_bc", "e2e_iql"])
+def test_renamed_cameras_may_have_another_size(
+    policy_type: str,
+    names: dict[str, str],
+    checkpoints: dict[str, Path],
+    tmp_path: Path,
+    lerobot_wm_command: Command,
+) -> None:
+    dataset, rename_map = record_renamed(tmp_path / "dataset", names)
+    run = tmp_path / "run"
+    lerobot_wm_command(
+        f"train --policy.path={checkpoints[policy_type]} {SHORT} {train_flags(dataset)} {rename_map}",
+        f"--save_freq=1 --output_dir={run}",
+    )
+    config = load(run / CHECKPOINT).config
+    assert config.input_features[FRONT].shape == (3, 60, 40)
+    assert config.input_features[WRIST].shape == (3, 32, 32)
+    settings = run / CHECKPOINT / "train_config.json"
+    lerobot_wm_command(f"train --config_path={settings} --resume=true --steps=2 --output_dir={run}")
+    assert load(run / CHECKPOINT).config.input_features == config.input_features
+
+
+def test_plain_lerobot_train_knows_the_size_of_renamed_cameras_that_are_alike(
+    checkpoints: dict[str, Path], tmp_path: Path, lerobot_train_command: Command
+) -> None:
+    """LeRobot tells a policy of no map."""
+    names = {"observation.images.a": FRONT, "observation.images.b": WRIST}
+    renamed = {**features(), **REWARDS, **{name: camera(60, 40) for name in names}}
+    del renamed[FRONT], renamed[WRIST]
+    dataset = record(tmp_path / "dataset", renamed, [("Wave", 5)])
+    lerobot_train_command(
+        f"--policy.path={checkpoints['e2e_bc']} {SHORT} {train_flags(dataset)} --output_dir={tmp_path / 'run'} "
+        f"--rename_map={json.dumps(names).replace(' ', '')}"
+    )
+    shapes = load(tmp_path / "run" / CHECKPOINT).config.input_features
+    assert shapes[FRONT].shape == shapes[WRIST].shape == (3, 60, 40)
+
+
+def test_renamed_features_are_encoded_as_what_they_are_called_then(
+    encoded: tuple, other: LeRobotDataset, tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    dataset, rename_map = record_renamed(tmp_path / "dataset", RENAMED)
+    flags = f"encode --world_model_path={encoded[0]} --device=cpu --dataset.repo_id=test/recorded"
+    out = f"--output_repo_id=test/latents --output_root={tmp_path / 'latents'}"
+    lerobot_wm_command(flags, f"--dataset.root={dataset.root} {rename_map}", out)
+    latents, expected = LeRobotDataset("test/latents", root=tmp_path / "latents"), encoded[1](other)
+    for row, same in zip(latents, expected, strict=True):
+        assert torch.equal(row["observation.latent"], same["observation.latent"])
+        assert torch.equal(row["observation.joints"], same["observation.state"])
+
+
+def test_a_renamed_state_of_another_size_is_refused(
+    checkpoints: dict[str, Path], tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    """Before its images are encoded."""
+    renamed = {
+        ("observation.joints" if k == "observation.state" else k): v for k, v in features(state=9).items()
+    }
+    dataset = record(tmp_path / "dataset", renamed, [("Wave", 6)])
+    with pytest.raises(ValueError, match=r"wm_bc was trained with 'observation.state' of size 5, .* with 9"):
+        lerobot_wm_command(
+            f"train --policy.path={checkpoints['wm_bc']} {SHORT} {train_flags(dataset)}",
+            f'--rename_map={{"observation.joints":"observation.state"}} --output_dir={tmp_path / "run"}',
+        )
+    assert not (tmp_path / "dataset.cache").exists()
