@@ -8,6 +8,7 @@ from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
+from lerobot.policies.factory import get_policy_class
 
 from lerobot_wm.constants import ACTION, OBS_LATENT
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
@@ -20,6 +21,7 @@ from lerobot_wm.policies.iql_agent import end_column
 from lerobot_wm.policies.iql_config import IQLConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.multi_task_config import MultiTaskConfig
+from lerobot_wm.policies.networks import check_networks
 from lerobot_wm.policies.world_model_config import WorldModelConfig
 
 
@@ -37,7 +39,8 @@ def check_dataset_fits(
         rename_map: New names of the dataset's features.
 
     Raises:
-        ValueError: It lacks rewards or cameras, or has actions or numbers of another size than the checkpoint.
+        ValueError: It lacks rewards or cameras, or has actions or numbers of another size than the checkpoint; or the
+            policy's settings are not those of the checkpoint's networks.
     """
     if isinstance(config, IQLConfig):
         end_column(config, dataset_meta)
@@ -46,6 +49,7 @@ def check_dataset_fits(
     saved = read_config(config.pretrained_path, config.pretrained_revision)
     assert isinstance(saved, ImagePolicyConfig)  # LeRobot has read it, as `config`
     check_kept(config, saved)
+    check_networks(get_policy_class(saved.type), config, saved)
     if OBS_LATENT not in dataset_meta.features:
         cameras = [rename_map.get(key, key) for key in dataset_meta.camera_keys]
         _check_cameras(saved, cameras, dataset_meta.repo_id)

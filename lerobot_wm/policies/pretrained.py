@@ -16,6 +16,7 @@ from lerobot_wm.hub.model_card import TrainingData, model_card
 from lerobot_wm.policies.checkpoint import WHOLE, not_finite, read_config
 from lerobot_wm.policies.features import OWN_NAMES
 from lerobot_wm.policies.fine_tuning import check_action_size, check_kept, fit_to_dataset
+from lerobot_wm.policies.networks import check_networks
 from lerobot_wm.policies.world_model_config import WorldModelConfig
 
 # What `from_pretrained` is told of the Hub, for each file.
@@ -53,9 +54,9 @@ class StrictPolicy(PreTrainedPolicy):
 
         Raises:
             FileNotFoundError: The configuration or the weights are missing.
-            ValueError: The checkpoint is of another type, its configuration is not one of this release, keys are
-                missing, left over or of another shape, weights are not finite, or the sizes of the dataset or
-                environment are not the checkpoint's.
+            ValueError: The checkpoint is of another type, its configuration is not one of this release, `config` makes
+                other networks, keys are missing, left over or of another shape, weights are not finite, or the sizes
+                of the dataset or environment are not the checkpoint's.
         """
         hub = {name: kwargs[name] for name in _HUB_OPTIONS if name in kwargs}
         saved = read_config(pretrained_name_or_path, **hub)
@@ -69,6 +70,8 @@ class StrictPolicy(PreTrainedPolicy):
             "dataset_stats", None
         )  # the checkpoint's own hold; these may have other names (--rename_map)
         check_kept(config, saved)
+        if strict:
+            check_networks(cls, config, saved)
         if dataset_meta is None:
             check_action_size(config, saved)
         else:

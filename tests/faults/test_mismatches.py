@@ -84,6 +84,16 @@ CASES = [
         "wm_iql learns from rewards, but test/rewards has no next.reward and no next.done or next.success: add",
     ),
     ("rewards", GO_ON % "e2e_iql", "e2e_iql learns from rewards, but test/rewards has no next.reward"),
+    (
+        "demos",
+        GO_ON % "wm_rssm" + " --policy.rssm.use_proprio=true --policy.rssm.kl_scale=0.5",
+        "train: --policy.rssm.use_proprio=true (the checkpoint's is false): other networks than the checkpoint has",
+    ),
+    (
+        "demos",
+        GO_ON % "wm_bc" + " --policy.hidden_dims=[16] --policy.lr=0.001",
+        "train: --policy.hidden_dims=[16] (the checkpoint's is [8]): other networks than",
+    ),
     ("demos", TRAIN + "--policy.type=wm_bc", "--policy.type=wm_bc needs --policy.world_model_path="),
     ("latents", NEW_BC % "another", "These latents were encoded by world model "),
     ("latents of other tasks", NEW_BC % "wm_rssm", "tells of latents of the tasks "),

@@ -288,6 +288,73 @@ def test_what_a_checkpoint_holds_cannot_be_changed(
             make_policy(config, ds_meta=dataset.meta)
 
 
+def changed(path: Path, **settings: Any) -> PreTrainedConfig:
+    """The configuration of a checkpoint to go on from, with settings of `--policy.path`'s flags."""
+    flags = [f"--{name.replace('__', '.')}={str(value).lower()}" for name, value in settings.items()]
+    config = PreTrainedConfig.from_pretrained(path, cli_overrides=flags)
+    config.pretrained_path = path
+    return config
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "settings"),
+    [
+        ("wm_rssm", {"rssm__use_proprio": True}),
+        ("wm_rssm", {"rssm__predict_reward": False, "rssm__action_scale": 0.1, "rssm__deter_dim": 32}),
+        ("wm_bc", {"use_latent": False}),
+        ("wm_iql", {"hidden_dims": [64]}),
+        ("e2e_bc", {"encoder": "resnet18"}),
+    ],
+)
+def test_settings_that_make_other_networks_are_refused(
+    policy_type: str,
+    settings: dict[str, Any],
+    checkpoints: dict[str, Path],
+    known: LeRobotDataset,
+    encoded: tuple,
+) -> None:
+    path = checkpoints[policy_type]
+    dataset = encoded[1](known) if policy_type.startswith("wm_b") else known
+    with pytest.raises(ValueError, match="other networks than the checkpoint has weights for") as refusal:
+        make_policy(changed(path, **settings, push_to_hub=False, use_amp=True), ds_meta=dataset.meta)
+    for name, value in settings.items():
+        assert f"--policy.{name.replace('__', '.')}={str(value).lower()} (the checkpoint's is " in str(
+            refusal.value
+        )
+    assert str(refusal.value).count("(the checkpoint's is ") == len(settings)
+
+
+def test_weights_may_be_left_out_where_loading_is_not_strict(checkpoints: dict[str, Path]) -> None:
+    path = checkpoints["wm_rssm"]
+    policy = WMRSSMPolicy.from_pretrained(path, config=changed(path, rssm__use_proprio=True), strict=False)
+    assert policy.world_model.config.use_proprio
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "settings"),
+    [
+        (
+            "wm_rssm",
+            {"rssm__kl_scale": 0.3, "rssm__free_nats": 0.5, "rssm__image_shift": 2, "window_length": 3},
+        ),
+        ("e2e_iql", {"lr": 0.1, "dropout": 0.5, "expectile": 0.9, "random_crop_pad": 4}),
+    ],
+)
+def test_other_settings_may_be_changed(
+    policy_type: str, settings: dict[str, Any], checkpoints: dict[str, Path], known: LeRobotDataset
+) -> None:
+    torch.manual_seed(0)
+    unchanged, drawn = go_on(checkpoints[policy_type], known), torch.randn(3)
+    torch.manual_seed(0)
+    policy = make_policy(changed(checkpoints[policy_type], **settings), ds_meta=known.meta)
+    assert torch.equal(torch.randn(3), drawn), "a seeded training would draw other numbers"
+    for name, tensor in unchanged.state_dict().items():
+        assert torch.equal(policy.state_dict()[name], tensor)
+    for name, value in settings.items():
+        *path, last = name.split("__")
+        assert getattr(policy.config.rssm if path else policy.config, last) == value
+
+
 def test_a_world_model_of_scaled_images_goes_on_with_renamed_cameras(
     folder: Path, known: LeRobotDataset, tmp_path: Path, lerobot_wm_command: Command
 ) -> None:
