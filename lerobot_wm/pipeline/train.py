@@ -25,6 +25,7 @@ from lerobot_wm.pipeline.training_run import check_run_settings, check_training_
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.fits import check_dataset_fits
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
+from lerobot_wm.policies.world_model_config import WorldModelConfig
 
 TRAIN_LOG_NAME = "train_log.jsonl"
 
@@ -110,6 +111,12 @@ def train(cfg: TrainPipelineConfig) -> None:
         )
     if cfg.dataset.streaming:
         raise ValueError("--dataset.streaming=true reads no dataset into memory: use lerobot-train for it.")
+    if isinstance(cfg.policy, WorldModelConfig) and cfg.env is not None and cfg.env_eval_freq > 0:
+        raise ValueError(
+            f"--env.type={cfg.env.type}: {cfg.policy.type} makes latents and chooses no actions, so that no "
+            "environment can evaluate it. Leave the flag out, or set --env_eval_freq=0, and evaluate a policy on its "
+            "latents, --policy.type=wm_bc or wm_iql."
+        )
     if cfg.policy.pretrained_path is not None:
         check_processors(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
     if cfg.resume:

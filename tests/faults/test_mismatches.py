@@ -95,6 +95,16 @@ CASES = [
         "train: --policy.hidden_dims=[16] (the checkpoint's is [8]): other networks than",
     ),
     ("demos", TRAIN + "--policy.type=wm_bc", "--policy.type=wm_bc needs --policy.world_model_path="),
+    (
+        "demos",
+        TRAIN + "--policy.type=wm_rssm --env.type=metaworld_mt --env.task=reach-v3",
+        "--env.type=metaworld_mt: wm_rssm makes latents and chooses no actions, so that no env",
+    ),
+    (
+        "demos",
+        GO_ON % "wm_rssm" + " --env.type=pusht",
+        "--env.type=pusht: wm_rssm makes latents and chooses no act",
+    ),
     ("latents", NEW_BC % "another", "These latents were encoded by world model "),
     ("latents of other tasks", NEW_BC % "wm_rssm", "tells of latents of the tasks "),
     (
