@@ -10,6 +10,7 @@ Prints one JSON document: `provenance` and `rows` in the form of results/benchma
 import argparse
 import json
 import os
+import shlex
 import statistics
 import subprocess
 import sys
@@ -210,7 +211,8 @@ def main() -> None:
     os.environ.pop(CACHE_VARIABLE, None)  # frames lie beside the data, and go with it
     with tempfile.TemporaryDirectory() as folder:
         rows = measure(Path(folder), args.gigabytes)
-    text = json.dumps({"provenance": provenance(), "rows": rows}, indent=2)
+    source = {**provenance(), "command": f"python -m benchmarks.memory {shlex.join(sys.argv[1:])}"}
+    text = json.dumps({"provenance": source, "rows": rows}, indent=2)
     print(text)
     if args.output is not None:
         args.output.write_text(text + "\n")

@@ -106,7 +106,7 @@ def test_command_prints_and_merges_into_its_file(
         results[0]["provenance"]["command"]
         == f"python -m benchmarks --rows=row --repeats=1 --output={output}"
     )
-    assert {"torch", "CPU cores"} <= results[0]["provenance"].keys()
+    assert {"torch", "CPU", "CPU cores"} <= results[0]["provenance"].keys()
     table = output.with_suffix(".md").read_text().splitlines()
     assert len(table) == 2 + len(results)
     cells = [cell.strip() for cell in table[2].split("|")[1:-1]]

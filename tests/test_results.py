@@ -121,6 +121,17 @@ def test_readme_shows_the_committed_measurements() -> None:
     assert set(shown) <= measured
 
 
+def test_the_page_of_benchmarks_shows_the_measured_memory() -> None:
+    folder = ROOT / "results" / "benchmarks"
+    peak, warm, cold = json.loads((folder / "memory.json").read_text())["rows"]
+    page = (folder / "README.md").read_text().split("## Memory")[1]
+    assert f"| {peak['ours']:.1f} GB | at most the frames and 2.5 GB: {peak['peer']:.1f} GB |" in page
+    assert f"the process has {peak['private']:.1f} GB to itself" in page
+    for row, side, key in ((warm, "warm", "ours"), (warm, "RAM", "peer"), (cold, "cold", "ours")):
+        speeds = row["repeats"][side]
+        assert f"{row[key]:,.0f} [{speeds[0]:,}, {speeds[-1]:,}]" in page
+
+
 def test_precision_page_shows_the_committed_trainings_and_rollouts() -> None:
     script = runpy.run_path(str(ROOT / "scripts" / "compare_precision.py"))
     folder = ROOT / "results" / "precision"

@@ -18,7 +18,7 @@ from rich.table import Table
 from tqdm import tqdm
 
 from lerobot_wm.constants import ENV_TYPE
-from lerobot_wm.cores import usable_cores
+from lerobot_wm.cores import cpu_kind, usable_cores
 
 DISTRIBUTION = "lerobot_policy_wm"
 MAIN_PACKAGES = ("lerobot", "torch", "metaworld", "mujoco")
@@ -158,11 +158,7 @@ def check_discovery() -> Check:
 
 def check_cpu() -> Check:
     """Cores, threads PyTorch uses and whether the CPU computes bfloat16 natively."""
-    cpuinfo = Path("/proc/cpuinfo")
-    flags = cpuinfo.read_text().split() if cpuinfo.exists() else []
-    bf16 = [flag for flag in ("amx_bf16", "avx512_bf16", "bf16") if flag in flags]
-    found = f"{usable_cores()} cores, {torch.get_num_threads()} PyTorch threads"
-    return Check("CPU", f"{found}, native bfloat16: {bf16[0] if bf16 else 'no'}")
+    return Check("CPU", f"{usable_cores()} cores, {torch.get_num_threads()} PyTorch threads, {cpu_kind()}")
 
 
 def check_gpu() -> Check:

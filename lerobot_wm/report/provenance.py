@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from lerobot_wm.cores import usable_cores
+from lerobot_wm.cores import cpu_kind, usable_cores
 
 PACKAGES = ("lerobot_policy_wm", "lerobot", "torch", "mujoco", "metaworld", "gymnasium", "numpy")
 
@@ -19,6 +19,7 @@ def provenance() -> dict[str, str]:
     facts = {"command": command, "python": platform.python_version()}
     facts |= {package: version(package) for package in PACKAGES}
     facts["system"] = f"{platform.system()} {platform.machine()}"
+    facts["CPU"] = cpu_kind()
     facts["CPU cores"] = str(usable_cores())
     facts["GPU"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return facts
