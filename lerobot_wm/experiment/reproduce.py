@@ -51,7 +51,8 @@ def parser() -> argparse.ArgumentParser:
         type=int,
         choices=VARIATION_SETS,
         default=REPORTED_VARIATION_SET,
-        help="positions to roll out on: 42 is the table, 43 is for choosing settings and recorded apart",
+        help="positions to roll out on: 42 is the table, 43 is for choosing settings, 44 for confirming; each is "
+        "recorded apart",
     )
     parser.add_argument(
         "--quality", action="store_true", help="judge the world model, too (lerobot-wm quality)"

@@ -32,7 +32,7 @@ class ExpertConfig:
     output_dir: Path
     # A task, a set (mt6, mt10, mt50) or a comma-separated list.
     tasks: str = "mt6"
-    # Set of variations: 42, on which results are reported, or 43, for choosing settings and for probes.
+    # Set of variations: 42, for reporting results; 43, for choosing settings and for probes; 44, for confirming.
     variation_set: int = REPORTED_VARIATION_SET
     # Variations to roll out on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
     variations: str = f"0-{NUM_VARIATIONS - 1}"
