@@ -15,7 +15,7 @@ from benchmarks.environments import ROOT
 from benchmarks.measure import Result, measure_row
 from benchmarks.rows import ROWS, Row
 from benchmarks.table import WIDTH, markdown_table, results_table, rows_table, size_text
-from lerobot_wm.cores import usable_cores
+from lerobot_wm.cores import cpu_kind, usable_cores
 from lerobot_wm.report.provenance import provenance
 
 SCALES = {"small": 0.1, "normal": 1.0, "large": 10.0}
@@ -71,9 +71,24 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--scale", type=parse_scale, default=1.0, help="small, normal, large or a factor")
     parser.add_argument("--threads", type=positive, default=1, help="of each side's process")
     parser.add_argument("--repeats", type=positive, default=3, help="of each side, by turns")
-    default = ROOT / "results" / "benchmarks" / f"cpu{usable_cores()}.json"
+    default = ROOT / "outputs" / "benchmarks" / f"cpu{usable_cores()}.json"
     parser.add_argument("--output", type=Path, default=default, help="JSON file; rows that are in it stay")
     return parser.parse_args(arguments)
+
+
+def check_machine(path: Path) -> None:
+    """Refuse to put measurements beside those of another processor.
+
+    Raises:
+        SystemExit: The file holds some; names both processors.
+    """
+    entries = json.loads(path.read_text()) if path.is_file() else []
+    others = {entry["provenance"].get("CPU", "one that was not noted") for entry in entries} - {cpu_kind()}
+    if others:
+        sys.exit(
+            f"{path} was measured on another processor ({', '.join(others)}; here it is {cpu_kind()}): "
+            "give another --output."
+        )
 
 
 def write(results: list[Result], path: Path) -> None:
@@ -98,6 +113,7 @@ def main(arguments: list[str]) -> int:
     if flags.list:
         console.print(rows_table(flags.rows, flags.scale))
         return 0
+    check_machine(flags.output)
     source = {**provenance(), "command": f"python -m benchmarks {shlex.join(arguments)}"}
     results: list[Result] = []
     failures = 0

@@ -27,7 +27,6 @@ import torch
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from torch import Tensor
 from torch.utils.data import BatchSampler
 
 from lerobot_wm.constants import FPS, OBS_IMAGE
@@ -111,8 +110,8 @@ def frames_file(root: Path) -> Path:
 class ResidentDataset(RamDataset):
     """The same, with the frames copied into the process's own memory."""
 
-    def _resident(self, cameras: dict[str, Tensor]) -> dict[str, Tensor]:
-        return {key: frames.clone() for key, frames in cameras.items()}
+    def _fit_on_device(self) -> bool:
+        return True
 
 
 def windows_per_second(source: RamDataset, batches: Iterable[list[int]]) -> float:

@@ -77,3 +77,14 @@ def test_the_precision_is_lerobots(
     cfg = TrainPipelineConfig(DatasetConfig("test/demos"), policy=policy, output_dir=tmp_path)
     assert make_accelerator(cfg).mixed_precision == expected
     AcceleratorState._reset_state(reset_partial_state=True)
+
+
+@pytest.mark.parametrize(
+    ("policy", "sends"), [(ACTConfig(device="cpu"), True), (E2EBCConfig(device="cpu"), False)]
+)
+def test_buffers_are_sent_around_where_processes_may_differ_in_them(
+    policy: PreTrainedConfig, sends: bool, tmp_path: Path
+) -> None:
+    """Ours are alike, and one can be as long as the dataset."""
+    cfg = TrainPipelineConfig(DatasetConfig("test/demos"), policy=policy, output_dir=tmp_path)
+    assert make_accelerator(cfg).ddp_handler.broadcast_buffers is sends

@@ -127,6 +127,19 @@ def test_command_goes_on_after_a_failure_and_reports_it(
     assert len(json.loads(output.read_text())) == 3
 
 
+def test_measurements_of_another_processor_are_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "ROWS", (row("peer"),))
+    output = tmp_path / "results.json"
+    command.main(["--rows=row", "--repeats=1", f"--output={output}"])
+    before = output.read_text()
+    monkeypatch.setattr(command, "cpu_kind", lambda: "another")
+    with pytest.raises(SystemExit, match=r"measured on another processor .*here it is another.*--output"):
+        command.main(["--rows=row", "--repeats=1", f"--output={output}"])
+    assert output.read_text() == before
+
+
 def test_list_names_every_row(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["--list"]) == 0
     printed = capsys.readouterr().out

@@ -61,3 +61,17 @@ def test_optional_parts_never_fail_the_command() -> None:
     check = doctor.Check("GPU", "driver too old", "update it", needed=False)
     assert check.verdict == "mend: update it"
     assert not check.is_broken
+
+
+def test_of_two_installations_the_imported_one_counts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As in an environment on top of the system's packages, one of which an interrupted pip left without a name."""
+    for folder, version in (("own", "2.0"), ("system", "1.0")):
+        made = tmp_path / folder / f"something-{version}.dist-info"
+        made.mkdir(parents=True)
+        (made / "METADATA").write_text(f"Metadata-Version: 2.1\nName: something\nVersion: {version}\n")
+        monkeypatch.syspath_prepend(tmp_path / folder) if folder == "system" else None
+    (tmp_path / "system" / "broken-1.0.dist-info").mkdir()
+    monkeypatch.syspath_prepend(tmp_path / "own")
+    assert doctor.installed_versions()["something"] == "2.0"

@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import av
@@ -10,6 +11,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.vector import AutoresetMode
+from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
@@ -20,11 +23,13 @@ from lerobot.scripts.lerobot_eval import eval_policy
 
 from lerobot_wm import cli
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
+from lerobot_wm.pipeline import rollouts
 from lerobot_wm.pipeline.eval_config import BatchedEvalConfig, EvaluateConfig, variation_of
 from lerobot_wm.pipeline.evaluate import evaluate
 from lerobot_wm.pipeline.rollouts import TaskRunner, training_seed
+from lerobot_wm.policies import checkpoint
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
-from lerobot_wm.report.records import RECORD_KEYS, read_records
+from lerobot_wm.report.records import Record, read_records
 
 IMAGE = PolicyFeature(FeatureType.VISUAL, (64, 64, 3))
 VECTOR = PolicyFeature(FeatureType.STATE, (4,))
@@ -175,12 +180,30 @@ def test_records_agree_with_lerobot_eval(policy_path: Path, tmp_path: Path) -> N
     np.testing.assert_allclose([r["return"] for r in records], [e["sum_reward"] for e in theirs], rtol=1e-5)
 
 
+def test_videos_end_with_the_episode_where_the_next_begins_at_once(
+    policy_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in PushT and ALOHA, which LeRobot has reset within the last step."""
+
+    def create(self: WalkEnvConfig, n_envs: int, use_async_envs: bool = False) -> dict:
+        make = partial(WalkEnv, "far", 0.6)
+        return {"far": {0: gym.vector.SyncVectorEnv([make] * n_envs, autoreset_mode=AutoresetMode.SAME_STEP)}}
+
+    monkeypatch.setattr(WalkEnvConfig, "create_envs", create)
+    cfg = config_for(policy_path, tmp_path, WalkEnvConfig(), 1, 1, videos_per_task=1)
+    [record] = evaluate(cfg)
+    [video] = (tmp_path / "videos").rglob("*.mp4")
+    with av.open(video) as container:
+        frames = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(video=0)]
+    assert frames == pytest.approx([20 * t for t in range(record["steps"])], abs=4)
+
+
 def test_records_of_any_environment(policy_path: Path, tmp_path: Path) -> None:
     cfg = config_for(policy_path, tmp_path, WalkEnvConfig(), 3, 3, arm="mine", preset="tiny")
     records = evaluate(cfg)
     assert records == read_records([tmp_path / "records.jsonl"])
     for record in records:
-        assert record.keys() == RECORD_KEYS
+        assert record.keys() == Record.__annotations__.keys()
         assert (record["arm"], record["policy_type"], record["preset"]) == ("mine", "act", "tiny")
         assert record["seed"] == 7, "the training seed, from train_config.json"
         assert record["seen"] is None
@@ -283,6 +306,35 @@ def test_bad_flags_are_refused(policy_path: Path, tmp_path: Path, change: dict, 
         setattr(cfg, name, value)
     with pytest.raises(ValueError, match=message):
         evaluate(cfg)
+
+
+def test_processors_and_seed_are_of_the_policys_revision(
+    policy_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that were checked before."""
+    asked = []
+    make = rollouts.make_pre_post_processors
+
+    def noting(*args: object, pretrained_revision: str | None = None, **kwargs: object) -> tuple:
+        asked.append(pretrained_revision)
+        return make(*args, **kwargs)
+
+    monkeypatch.setattr(rollouts, "make_pre_post_processors", noting)
+    monkeypatch.setattr(rollouts, "training_seed", lambda path, revision: asked.append(revision))
+    cfg = config_for(policy_path, tmp_path, WalkEnvConfig(), 1, 1)
+    cfg.policy.pretrained_revision = "v1"
+    TaskRunner(cfg)
+    assert asked == ["v1", "v1"]
+
+
+def test_a_hub_that_cannot_be_reached_is_no_broken_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    def offline(*args: object, **kwargs: object) -> str:
+        raise LocalEntryNotFoundError("not in the cache")
+
+    monkeypatch.setattr(checkpoint, "hf_hub_download", offline)
+    with pytest.raises(LocalEntryNotFoundError):
+        checkpoint.read_config("user/policy")
+    assert training_seed(Path("user/policy")) is None, "where the rest of it is here"
 
 
 def test_a_checkpoint_without_training_configuration_has_no_seed(tmp_path: Path) -> None:

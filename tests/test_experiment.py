@@ -100,6 +100,17 @@ def test_committed_records_count_as_done(committed: Path) -> None:
     assert list(times) == ["wm_bc_0"]
 
 
+def test_what_is_taken_from_committed_records_is_named(committed: Path) -> None:
+    """Changed settings would have no effect on it."""
+    with (committed / "printed").open("w+") as file:
+        arms = experiment(committed, [("wm_bc", 0), ("wm_bc", 1)])
+        arms.tell_committed(Console(file=file, width=200))
+        file.seek(0)
+        [line] = file.read().replace("\n", "").splitlines()
+    assert f"taken from {committed / 'results' / 'records.jsonl'}: wm_bc 0 (arm and seed)" in line
+    assert "--results_dir=outputs/none runs them" in line
+
+
 def test_list_says_what_is_done_and_what_is_left(committed: Path) -> None:
     with (committed / "printed").open("w+") as file:
         experiment(committed, [("wm_bc", 0), ("wm_bc", 1)]).show(Console(file=file, width=80))

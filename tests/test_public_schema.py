@@ -178,7 +178,11 @@ def test_where_a_task_ends_can_be_named(tmp_path: Path) -> None:
         "next.done": torch.tensor([0.0, 0, 0, 1]),
         "next.reward": torch.zeros(4),
     }
-    for done_key, expected in ((None, [False, False, False, True]), ("next.success", [False] * 4)):
+    for done_key, expected in (
+        (None, [False] * 3 + [True]),
+        ("next.success", [False] * 4),
+        ("never", [False] * 4),
+    ):
         config = make_policy_config("e2e_iql", done_key=done_key, device="cpu")
         assert Outcomes(config, failed.meta)(batch)[1].tolist() == expected
     with pytest.raises(ValueError, match=r"has no next\.over"):

@@ -263,6 +263,25 @@ def test_latents_of_another_world_model_are_refused(
         encode_share(policy, many_episodes, tmp_path / "latents", Share(1, 2))
 
 
+def test_what_jobs_made_is_not_removed_for_the_sake_of_something_else(
+    many_episodes: LeRobotDataset, world_model_path: Path, tmp_path: Path
+) -> None:
+    policy, root = load_encoder(str(world_model_path)), tmp_path / "latents"
+    for there in (
+        Path.mkdir,
+        lambda root: encode(policy, many_episodes, "test/latents", root, sample_seed=0),
+    ):
+        there(root)
+        shutil.rmtree(tmp_path / "latents.parts", ignore_errors=True)
+        root.rename(tmp_path / "aside")
+        encode_share(policy, many_episodes, root, Share(2, 2))
+        (tmp_path / "aside").rename(root)
+        with pytest.raises(FileExistsError, match="is there already"):
+            encode(policy, many_episodes, "test/latents", root)
+        assert len(list((tmp_path / "latents.parts").iterdir())) == 1
+        shutil.rmtree(root)
+
+
 def test_a_push_of_other_samples_is_refused(
     demos_root: Path,
     world_model_path: Path,

@@ -6,7 +6,6 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +27,13 @@ from lerobot_wm.data.resize import resize_images
 
 logger = logging.getLogger(__name__)
 
+_VIDEO_CHANNELS = 3
 CACHE_VARIABLE = "LEROBOT_WM_CACHE"
 
 # Of frames that each thread holds at once: bounds memory for long episodes of large images.
 _CHUNK_BYTES = 2**25
+_RESIZED_AT_ONCE = 8  # frames, which are four times as large then
+_MAX_THREADS = 16  # each of which holds a chunk two or three times
 
 
 def cache_root(dataset_root: Path) -> Path:
@@ -83,7 +85,7 @@ class CameraCache:
         self._dataset = dataset
         self._key = key
         self._folder = folder
-        height, width, channels = self._frame_shape()
+        height, width, channels = frame_shape(dataset.meta.features[key])
         name = key
         if size not in (None, (height, width)):
             name = f"{key}-{size[0]}x{size[1]}"
@@ -99,7 +101,7 @@ class CameraCache:
         return self._frames
 
     def ensure(self, episodes: Iterable[int]) -> None:
-        """Decode the episodes that are not in the cache yet, on all cores.
+        """Decode the episodes that are not in the cache yet, on up to 16 cores.
 
         Raises:
             OSError: Their frames do not fit on the disk.
@@ -109,7 +111,7 @@ class CameraCache:
         if not missing:
             return
         self._check_room(missing)
-        with ThreadPoolExecutor(usable_cores()) as pool:
+        with ThreadPoolExecutor(min(usable_cores(), _MAX_THREADS)) as pool:
             done = pool.map(self._decode, missing)
             list(tqdm(done, total=len(missing), desc=f"Decoding {self._key}", unit="episode", leave=False))
 
@@ -131,10 +133,11 @@ class CameraCache:
         self._reserve(position, row["length"])
         try:
             for images in self._images(row):
-                if images.shape[-2:] != size:
-                    images = (resize_images(images.float() / 255, size) * 255).round().to(torch.uint8)
-                self._frames[position : position + len(images)] = images.permute(0, 2, 3, 1).numpy()
-                position += len(images)
+                for part in images.split(_RESIZED_AT_ONCE):
+                    if part.shape[-2:] != size:
+                        part = (resize_images(part.float() / 255, size) * 255).round().to(torch.uint8)
+                    self._frames[position : position + len(part)] = part.permute(0, 2, 3, 1).numpy()
+                    position += len(part)
         except Exception as error:  # what decoders raise for damaged bytes is not documented
             raise DatasetError(
                 f"{self._file(episode)}: the images of {self._key} in episode {episode} cannot be decoded "
@@ -166,7 +169,7 @@ class CameraCache:
         """An episode's frames as they are stored, some at a time: (T, C, H, W) uint8."""
         meta = self._dataset.meta
         start, stop = row["dataset_from_index"], row["dataset_to_index"]
-        count = max(1, _CHUNK_BYTES // math.prod(self._frame_shape()))
+        count = max(1, _CHUNK_BYTES // math.prod(frame_shape(meta.features[self._key])))
         if self._key in meta.video_keys:
             first = row[f"videos/{self._key}/from_timestamp"]
             for position in range(0, stop - start, count):
@@ -186,36 +189,52 @@ class CameraCache:
             rows = column[first : first + min(count, stop - position)][self._key]
             yield (torch.stack(rows) * 255).round().to(torch.uint8)
 
-    def _frame_shape(self) -> tuple[int, int, int]:
-        feature = self._dataset.meta.features[self._key]
-        shape = tuple(feature["shape"])
-        return shape if feature["names"][2].startswith("channel") else (*shape[1:], shape[0])
-
     @staticmethod
     def _open(path: Path, shape: tuple[int, ...]) -> np.memmap:
         if path.is_file():
             return open_memmap(path, mode="r+")
         partial = path.with_suffix(f".{os.getpid()}.tmp")
-        open_memmap(partial, mode="w+", dtype=np.uint8, shape=shape).flush()
-        # A hard link, not a rename: where another process was faster its file stays, and both write into that one.
-        with suppress(FileExistsError):
-            os.link(partial, path)
-        partial.unlink()
+        try:
+            open_memmap(partial, mode="w+", dtype=np.uint8, shape=shape).flush()
+            # A hard link, not a rename: where another process was faster its file stays, and both write into that one.
+            try:
+                os.link(partial, path)
+            except FileExistsError:
+                pass
+            except OSError:  # exFAT and some file systems of the network know no links
+                partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
         return open_memmap(path, mode="r+")
 
 
-def check_no_depth(dataset: LeRobotDataset, keys: Iterable[str]) -> None:
-    """Refuse cameras whose pixels are distances.
+def check_colours(dataset: LeRobotDataset, keys: Iterable[str]) -> None:
+    """Refuse cameras whose pixels are distances, and videos of anything but three colours, which is what is decoded.
 
     Raises:
-        ValueError: Some of the keys are depth cameras.
+        ValueError: Some of the keys are such cameras.
     """
+    keys = list(keys)
     depth = [key for key in keys if key in dataset.meta.depth_keys]
     if depth:
         raise ValueError(
             f"{dataset.repo_id} has depth cameras, {', '.join(depth)}; models here see colours, 0 to 255. Choose the "
             "others with --policy.image_key, or remove these with lerobot-edit-dataset."
         )
+    for key in set(keys) & set(dataset.meta.video_keys):
+        channels = frame_shape(dataset.meta.features[key])[2]
+        if channels != _VIDEO_CHANNELS:
+            raise ValueError(
+                f"{dataset.repo_id} has videos of {channels} channels of {key}; models here take videos of "
+                f"{_VIDEO_CHANNELS}, red, green and blue. Choose the others with --policy.image_key, or record grey "
+                "frames with three channels that are equal."
+            )
+
+
+def frame_shape(feature: dict[str, Any]) -> tuple[int, int, int]:
+    """(H, W, C) of a camera's frames, from its entry in a dataset's `features`."""
+    shape = tuple(feature["shape"])
+    return shape if feature["names"][2].startswith("channel") else (*shape[1:], shape[0])
 
 
 def camera_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int] | None = None) -> Tensor:
@@ -229,9 +248,9 @@ def camera_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int] | Non
         size: (H, W) that frames are resized to, once; None leaves them as they are in the dataset.
 
     Raises:
-        ValueError: It is a depth camera.
+        ValueError: It is a depth camera, or has videos that are not in three colours.
     """
-    check_no_depth(dataset, [key])
+    check_colours(dataset, [key])
     folder = cache_root(Path(dataset.root)) / f"frames-{dataset_fingerprint(Path(dataset.root))}"
     folder.mkdir(exist_ok=True)
     cache = CameraCache(dataset, key, folder, size)

@@ -50,5 +50,6 @@ def check_finite_columns(columns: Mapping[str, Tensor], tasks: Sequence[str], re
         )
         raise DatasetError(
             f"{repo_id}: {key} holds NaN or Inf in episode {episode} (task {tasks[task]!r}), frame {frame}: nothing "
-            "can be learned from it. Remove the episode with lerobot-edit-dataset, or record it again."
+            "can be learned from it. Remove the episode with lerobot-edit-dataset, or record it again; or remove the "
+            "feature there, if no policy is to read it."
         )

@@ -8,11 +8,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
-from lerobot_wm.data.cache import camera_frames, check_no_depth
+from lerobot_wm.data.cache import camera_frames, check_colours
 from lerobot_wm.data.check_info import TEXT_DTYPES
 from lerobot_wm.data.finite import check_finite_columns
 from lerobot_wm.data.tables import column_tensor
 
+_COPIED_AT_ONCE = 1024  # frames
 _GPU_SHARE = 0.6  # of the free GPU memory may be taken by resident frames; activations need the rest
 
 
@@ -48,7 +49,7 @@ class RamDataset:
             )
         self.device = device
         meta = dataset.meta
-        check_no_depth(dataset, meta.camera_keys if cameras is None else cameras)
+        check_colours(dataset, meta.camera_keys if cameras is None else cameras)
         self._tasks = [str(task) for task in meta.tasks.index]
         self._deltas: dict[str, list[int]] = dataset.reader.delta_indices or {}
         kinds = {key: feature["dtype"] for key, feature in meta.features.items()}
@@ -66,13 +67,17 @@ class RamDataset:
         check_finite_columns(self._columns, self._tasks, dataset.repo_id)
         # PNG frames leave LeRobot's loader as float32, video frames as uint8 for the training loop to convert.
         self._float_cameras = set(meta.image_keys)
-        self._cameras = self._resident(
-            {
-                key: camera_frames(dataset, key, None if cameras is None else cameras[key])
-                for key in meta.camera_keys
-                if cameras is None or key in cameras
-            }
-        )
+        self._cameras = {
+            key: camera_frames(dataset, key, None if cameras is None else cameras[key])
+            for key in meta.camera_keys
+            if cameras is None or key in cameras
+        }
+        self._frame_of_row = self._columns[
+            "index"
+        ]  # (N,), which is no row's number where episodes were chosen
+        if self._fit_on_device():
+            self._cameras = {key: self._on_device(frames) for key, frames in self._cameras.items()}
+            self._frame_of_row = torch.arange(len(self._frame_of_row), device=device)
 
         episode = self._columns["episode_index"]
         starts = torch.searchsorted(episode, episode)  # rows of an episode are consecutive
@@ -110,17 +115,25 @@ class RamDataset:
     def _images(self, key: str, rows: Tensor) -> Tensor:
         """Frames (B, C, H, W) or (B, T, C, H, W): a channels-first view of channels-last memory."""
         frames = self._cameras[key]
-        images = gather(frames, self._columns["index"][rows].to(frames.device)).to(self.device)
+        images = gather(frames, self._frame_of_row[rows].to(frames.device)).to(self.device)
         images = images.movedim(-1, -3)
         return images.float() / 255 if key in self._float_cameras else images
 
-    def _resident(self, cameras: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _fit_on_device(self) -> bool:
         if self.device.type != "cuda":
-            return cameras
+            return False
         free, _ = torch.cuda.mem_get_info(self.device)
-        if sum(frames.numel() for frames in cameras.values()) >= _GPU_SHARE * free:
-            return cameras
-        return {key: frames.to(self.device) for key, frames in cameras.items()}
+        n_bytes = sum(len(self._frame_of_row) * frames[0].numel() for frames in self._cameras.values())
+        return n_bytes < _GPU_SHARE * free
+
+    def _on_device(self, frames: Tensor) -> Tensor:
+        """The frames of this dataset's own episodes in the device's memory, (N, H, W, C) uint8 by row."""
+        resident = frames.new_empty((len(self._frame_of_row), *frames.shape[1:]), device=self.device)
+        for part, index in zip(
+            resident.split(_COPIED_AT_ONCE), self._frame_of_row.cpu().split(_COPIED_AT_ONCE), strict=True
+        ):
+            part.copy_(gather(frames, index))
+        return resident
 
 
 class RamLoader:

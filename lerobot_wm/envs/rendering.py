@@ -17,13 +17,13 @@ import numpy as np
 
 from lerobot_wm.envs.cameras import HAND_CAMERAS, HAND_VIEW_CENTER, UPSIDE_DOWN
 
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+if sys.platform == "linux":  # with a display, too: it may be another machine's, where GLFW draws nothing
     os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco reads it when it is first imported
 
 GL_HELP = (
     "No headless OpenGL to draw with (MUJOCO_GL={backend}). On Debian or Ubuntu run\n"
     "    apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri\n"
-    "and use MUJOCO_GL=egl (the default without a display)."
+    "and use MUJOCO_GL=egl (the default)."
 )
 try:
     import mujoco  # which loads what MUJOCO_GL names, and without libEGL raises an AttributeError of PyOpenGL

@@ -60,6 +60,7 @@ class Arm:
 
 
 _SWEEP_FLAG = f"--policy.sweep_betas=[{','.join(map(str, SWEEP_BETAS))}]"
+_NO_END = ("--policy.done_key=never",)  # a dense reward that success ended would teach to put it off
 _WM_IQL = Arm("wm_iql", "wm_iql", WM_RSSM, train_flags=(_SWEEP_FLAG,))
 
 # In the order of tables: the paper's arms, then the controls.
@@ -73,8 +74,10 @@ ARMS: dict[str, Arm] = {
         _WM_IQL,
         Arm("wm_bc", "wm_bc", WM_RSSM),
         # The paper's end-to-end and individual IQL learn from the dense reward (section 4.3).
-        Arm("e2e_iql_dense", "e2e_iql", dense_reward=True),
-        Arm("e2e_iql_single_dense", "e2e_iql_single", individual=True, dense_reward=True),
+        Arm("e2e_iql_dense", "e2e_iql", dense_reward=True, train_flags=_NO_END),
+        Arm(
+            "e2e_iql_single_dense", "e2e_iql_single", individual=True, dense_reward=True, train_flags=_NO_END
+        ),
         Arm("wm_iql_single", "wm_iql_single", WM_RSSM, individual=True),
         Arm("wm_bc_single", "wm_bc_single", WM_RSSM, individual=True),
         *(

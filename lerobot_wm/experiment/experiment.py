@@ -40,7 +40,8 @@ class Experiment:
         self.processes = processes
         suffix = "" if plan.variation_set == REPORTED_VARIATION_SET else f"_set{plan.variation_set}"
         records = f"records{suffix}.jsonl"
-        self.ledger = Ledger(plan.output_dir / records, results_dir / records, plan.preset)
+        self._committed = results_dir / records
+        self.ledger = Ledger(plan.output_dir / records, self._committed, plan.preset)
         self.report_dir = plan.output_dir / f"report{suffix}"
         self.times = Times(plan.output_dir / "times.json", plan.preset.minutes)
         self._quality = [plan.quality(runs[0][1])] if quality else []
@@ -80,6 +81,18 @@ class Experiment:
         minutes = {name: self.times.minutes(stage.kind) for name, stage in todo.items()}
         left = minutes_text(minutes_left(todo, minutes, self.processes))
         console.print(f"Stages to run: {len(todo)}, about {left} with {self.processes} side by side")
+
+    def tell_committed(self, console: Console) -> None:
+        """Say which arms and seeds are not run: with changed settings their records would be taken for new ones."""
+        taken = [
+            f"{arm.name} {seed}" for arm, seed in self.runs if self.ledger.is_committed((arm.name, seed))
+        ]
+        if taken:
+            console.print(
+                f"Not run, but taken from {self._committed}: {', '.join(taken)} (arm and seed). "
+                "--results_dir=outputs/none runs them, too.",
+                highlight=False,
+            )
 
     def run(self, lock: IO, console: Console) -> list[Stage]:
         """Run what is left; returns the stages that failed.

@@ -36,6 +36,10 @@ class Ledger:
         """Whether an arm and seed is finished."""
         return run in self._committed or run in self._own
 
+    def is_committed(self, run: tuple[str, int]) -> bool:
+        """Whether an arm and seed is finished because its records were committed."""
+        return run in self._committed
+
     @property
     def empty(self) -> bool:
         """Whether nothing is finished."""

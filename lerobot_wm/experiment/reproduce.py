@@ -80,6 +80,7 @@ def main() -> None:
         with exclusive(output_dir) as lock:
             check_settings(preset, output_dir)
             experiment = Experiment(plan, runs, results_dir, args.processes, args.quality)
+            experiment.tell_committed(console)
             failed = experiment.run(lock, console)
             reported = experiment.report()
     except (ValueError, OSError) as error:

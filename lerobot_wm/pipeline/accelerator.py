@@ -20,7 +20,7 @@ from lerobot_wm.data.order import batches_of_rows
 from lerobot_wm.pipeline.divergence import LossWatch
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.features import names_before
-from lerobot_wm.policies.fine_tuning import fit_cameras
+from lerobot_wm.policies.fits import check_environment_fits
 
 # How long processes wait for the one that decodes or encodes; by default they give up after minutes.
 _PATIENCE = timedelta(days=1)
@@ -41,7 +41,14 @@ class RamAccelerator(Accelerator):
         self._loaders: list[RamLoader] = []  # that of the training data first
 
     def prepare_model(self, model: Any, *args: Any, **kwargs: Any) -> Any:
-        """Prepare the policy as accelerate does, and watch its loss."""
+        """Prepare the policy as accelerate does, and watch its loss.
+
+        Raises:
+            ValueError: It cannot act in the environment that is to evaluate it.
+        """
+        cfg = self._train_config
+        if cfg.env is not None and cfg.env_eval_freq > 0:  # now, not when the first evaluation is due
+            check_environment_fits(cfg.policy, cfg.env, cfg.rename_map)
         prepared = super().prepare_model(model, *args, **kwargs)
         self._watch.attach(prepared)
         return prepared
@@ -87,12 +94,8 @@ class RamAccelerator(Accelerator):
         batch_sampler = batches_of_rows(data_loader)
         if self.num_processes > 1:
             batch_sampler = BatchSamplerShard(batch_sampler, self.num_processes, self.process_index)
-        cfg = self._train_config
-        if cfg.rename_map and isinstance(cfg.policy, ImagePolicyConfig) and not self._loaders:
-            # LeRobot has made the policy and did not tell it the new names of the training data's cameras.
-            fit_cameras(cfg.policy, data_loader.dataset.meta, cfg.rename_map)
         with self.in_turn():  # the first decodes the frames, the others map them
-            loader = RamLoader(data_loader, batch_sampler, self.device, cameras_to_serve(cfg))
+            loader = RamLoader(data_loader, batch_sampler, self.device, cameras_to_serve(self._train_config))
         self._loaders.append(loader)
         return loader
 
@@ -137,7 +140,11 @@ def make_accelerator(cfg: TrainPipelineConfig) -> RamAccelerator:
         step_scheduler_with_optimizer=False,
         mixed_precision={"bfloat16": "bf16", "float16": "fp16", "float32": "no"}.get(dtype),
         kwargs_handlers=[
-            DistributedDataParallelKwargs(find_unused_parameters=True),
+            # Buffers of our policies are alike in all processes: one of a number per frame of the dataset would be sent
+            # around at every step.
+            DistributedDataParallelKwargs(
+                find_unused_parameters=True, broadcast_buffers=not isinstance(policy, ImagePolicyConfig)
+            ),
             InitProcessGroupKwargs(timeout=_PATIENCE),
         ],
         cpu=policy.device == "cpu",

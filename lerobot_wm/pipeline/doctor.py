@@ -114,10 +114,12 @@ def check_packages(installed: dict[str, str]) -> list[Check]:
 
 
 def installed_versions() -> dict[str, str]:
-    """Version per installed distribution (names in lower case, with dashes)."""
-    return {
-        d.metadata["Name"].lower().replace("_", "-"): d.version for d in importlib.metadata.distributions()
-    }
+    """Version per installed distribution (names in lower case, with dashes), of several the one that is imported."""
+    versions: dict[str, str] = {}
+    for found in importlib.metadata.distributions():
+        if name := found.metadata["Name"]:  # an installation that was broken off has none
+            versions.setdefault(name.lower().replace("_", "-"), found.version)
+    return versions
 
 
 def check_rendering() -> Check:

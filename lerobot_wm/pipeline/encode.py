@@ -7,6 +7,7 @@ import json
 import logging
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +126,9 @@ def _begin(
     """Refuse what cannot be encoded; the record of the result, and the place of its latents."""
     parts = parts_folder(output_root)
     if output_root.exists():
-        shutil.rmtree(parts, ignore_errors=True)  # left by a run killed at its very end
+        with suppress(ValueError):  # no latents of ours
+            if LatentRecord.read(output_root) == _record(policy, source, rename_map, sample_seed):
+                shutil.rmtree(parts, ignore_errors=True)  # left by a run killed at its very end
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
     cameras = names_before(policy.config.cameras, rename_map)
     missing = [key for key in cameras if key not in source.meta.camera_keys]

@@ -125,6 +125,7 @@ def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record
         "success": success,
         "steps": cfg.episode_length if demonstration is None else len(demonstration.actions),
         "return": float(success),
+        "variation_set": cfg.variation_set,
     }
 
 

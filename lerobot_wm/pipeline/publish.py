@@ -26,7 +26,6 @@ from lerobot_wm.report.records import Record, find_records, read_records
 from lerobot_wm.report.tables import ReportTable, markdown_table, table_by_split
 
 UPLOADED = ("*.safetensors", "*.json", "*.yaml")  # of a checkpoint's folder, as LeRobot uploads them
-SEEN = "Seen variations are those that demonstrations are collected on by default, 0-9 of set 42."
 
 
 @dataclass
@@ -83,8 +82,7 @@ def publish(cfg: PublishConfig) -> str:
         records = read_records(find_records(cfg.records))
         check_records(records, config.type, run.seed)
         title = f"Results ({records[0]['arm']}, preset {records[0]['preset']})"
-        table = table_by_split(title, records)
-        tables.append(replace(table, notes=[*table.notes, SEEN] if "seen" in table.columns else table.notes))
+        tables.append(table_by_split(title, records))
     files: dict[str, Path | bytes] = {
         path.name: path for pattern in UPLOADED for path in sorted(folder.glob(pattern))
     }
@@ -93,9 +91,10 @@ def publish(cfg: PublishConfig) -> str:
         policy = load_world_model(str(folder))
         dataset = cfg.dataset.open()
         predictions = open_loop(policy, dataset.repo_id, str(dataset.root))
-        files[IMAGINATION] = animation(predictions)
-        tasks = [prediction.task for prediction in predictions]
-        tables.append(psnr_table(predictions))
+        if predictions:
+            files[IMAGINATION] = animation(predictions)
+            tasks = [prediction.task for prediction in predictions]
+            tables.append(psnr_table(predictions))
     results = "".join(map(_section, tables)) or None
     card = model_card(
         get_policy_class(config.type),

@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
@@ -21,9 +22,9 @@ from lerobot_wm.report.records import Record
 VIDEO_SIZE = 256  # frames are enlarged by a whole factor up to this height (pixels)
 
 
-def training_seed(policy_path: Path | None) -> int | None:
+def training_seed(policy_path: Path | None, revision: str | None = None) -> int | None:
     """The seed a checkpoint (folder or Hub id) was trained with; None when it does not tell."""
-    return training_config(policy_path).get("seed")
+    return training_config(policy_path, revision).get("seed")
 
 
 class TaskRunner:
@@ -34,7 +35,7 @@ class TaskRunner:
         self.device = get_safe_torch_device(cfg.policy.device)
         torch.backends.cudnn.benchmark = True
         torch.backends.cuda.matmul.allow_tf32 = True
-        self.training_seed = training_seed(cfg.policy.pretrained_path)
+        self.training_seed = training_seed(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
         # One vector environment per batch size: a shorter last batch must not run further seeds.
         sizes = {len(seeds) for seeds in self._batches()}
         self.envs = {size: make_task_envs(cfg, size) for size in sizes}
@@ -42,6 +43,7 @@ class TaskRunner:
         preprocessor, postprocessor = make_pre_post_processors(
             policy_cfg=cfg.policy,
             pretrained_path=cfg.policy.pretrained_path,
+            pretrained_revision=cfg.policy.pretrained_revision,
             preprocessor_overrides={
                 "device_processor": {"device": str(self.policy.config.device)},
                 "rename_observations_processor": {"rename_map": cfg.rename_map},
@@ -85,8 +87,10 @@ class TaskRunner:
                 render_callback=(lambda env: frames.append(_render(env, filmed))) if filmed else None,
             )
         records = [self._record(task, seed, data, i) for i, seed in enumerate(seeds)]
+        # Else it has begun anew when it is looked at: the last picture is of the next episode's start.
+        shows_the_end = env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP
         for column, i in enumerate(filmed):
-            clip = [step[column] for step in frames[: records[i]["steps"] + 1]]
+            clip = [step[column] for step in frames[: records[i]["steps"] + shows_the_end]]
             outcome = "success" if records[i]["success"] else "failure"
             folder = self._videos(task)
             folder.mkdir(parents=True, exist_ok=True)
@@ -111,6 +115,7 @@ class TaskRunner:
             "success": bool(data["success"][i, :steps].any()),
             "steps": steps,
             "return": float(data["reward"][i, :steps].sum()),
+            "variation_set": getattr(self.cfg.env, "variation_set", None),
         }
 
 

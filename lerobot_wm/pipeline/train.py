@@ -23,6 +23,7 @@ from lerobot_wm.pipeline.processors import check_policy_path, check_processors
 from lerobot_wm.pipeline.train_resume import clear_unfinished, how_to_go_on, restore_last, stops_explained
 from lerobot_wm.pipeline.training_run import check_run_settings, check_training_state
 from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.fine_tuning import names_given_by
 from lerobot_wm.policies.fits import check_dataset_fits
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.world_model_config import WorldModelConfig
@@ -111,6 +112,16 @@ def train(cfg: TrainPipelineConfig) -> None:
         )
     if cfg.dataset.streaming:
         raise ValueError("--dataset.streaming=true reads no dataset into memory: use lerobot-train for it.")
+    if cfg.job.is_remote:
+        raise ValueError(
+            f"--job.target={cfg.job.target}: lerobot-wm train trains on this machine, and a job would run "
+            "lerobot-train without this package. Leave the flag out."
+        )
+    if cfg.sample_weighting is not None and isinstance(cfg.policy, ImagePolicyConfig):
+        raise ValueError(
+            f"--sample_weighting.type={cfg.sample_weighting.type}: {cfg.policy.type} has one loss for a batch, whose "
+            "samples cannot be weighed. Leave the flag out."
+        )
     if isinstance(cfg.policy, WorldModelConfig) and cfg.env is not None and cfg.env_eval_freq > 0:
         raise ValueError(
             f"--env.type={cfg.env.type}: {cfg.policy.type} makes latents and chooses no actions, so that no "
@@ -143,7 +154,8 @@ def _train(cfg: TrainPipelineConfig, accelerator: RamAccelerator) -> None:
     log = TrainLog(cfg.output_dir)
     logging.getLogger().addFilter(log)
     try:
-        with damage_named(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision):
+        named = damage_named(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
+        with named, names_given_by(cfg.rename_map):
             lerobot_train(cfg, accelerator=accelerator)
     finally:
         logging.getLogger().removeFilter(log)

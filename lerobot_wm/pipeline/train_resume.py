@@ -55,7 +55,8 @@ def clear_unfinished(checkpoint: Path, output_dir: Path) -> None:
 
     Raises:
         FileNotFoundError: The checkpoint itself is not whole.
-        FileExistsError: The folder holds later checkpoints, up to that which `last` names.
+        FileExistsError: The folder holds later checkpoints that are whole: up to that which `last` names, or more than
+            the one that a kill can leave beyond it.
     """
     if not is_whole(checkpoint):
         raise FileNotFoundError(
@@ -67,11 +68,12 @@ def clear_unfinished(checkpoint: Path, output_dir: Path) -> None:
     step = load_training_step(checkpoint / TRAINING_STATE_DIR)
     finished = load_training_step(last / TRAINING_STATE_DIR) if _is_set(last) else 0
     later = [saved for saved in _numbered(folder) if int(saved.name) > step]
+    whole = [saved.name for saved in later if is_whole(saved)]
     kept = [saved.name for saved in later if int(saved.name) <= finished]
-    if kept:
+    if kept or len(whole) > 1:
         raise FileExistsError(
-            f"{folder} holds later checkpoints, {', '.join(kept)}, which training on from step {step} would write "
-            f"over: go on from {last}, give another --output_dir, or remove them."
+            f"{folder} holds later checkpoints, {', '.join(kept or whole)}, which training on from step {step} would "
+            f"write over: go on from {last}, give another --output_dir, or remove them."
         )
     for saved in later:
         shutil.rmtree(saved)

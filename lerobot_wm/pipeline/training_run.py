@@ -1,9 +1,11 @@
 """What lies beside a checkpoint about the run that trained it."""
 
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.utils.constants import (
     OPTIMIZER_STATE,
@@ -15,10 +17,16 @@ from lerobot.utils.constants import (
 from lerobot_wm.pipeline.train_resume import is_whole
 from lerobot_wm.policies.checkpoint import WHOLE, check_tensors, checkpoint_file, read_json
 
+logger = logging.getLogger(__name__)
 
-def training_config(policy_path: Path | None) -> dict[str, Any]:
+
+def training_config(policy_path: Path | None, revision: str | None = None) -> dict[str, Any]:
     """The settings of the run that trained a checkpoint (folder or Hub id); empty where it does not tell."""
-    file = None if policy_path is None else checkpoint_file(policy_path, TRAIN_CONFIG_NAME)
+    try:
+        file = None if policy_path is None else checkpoint_file(policy_path, TRAIN_CONFIG_NAME, revision)
+    except LocalEntryNotFoundError:  # the rest of the checkpoint is here
+        logger.warning("%s of %s is not here, nor can the Hub be reached.", TRAIN_CONFIG_NAME, policy_path)
+        return {}
     return {} if file is None else json.loads(file.read_text())
 
 

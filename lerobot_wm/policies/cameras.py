@@ -47,7 +47,7 @@ class ImagePolicyConfig(PreTrainedConfig):
         return channels, *self.image_size
 
     def choose_cameras(self) -> None:
-        """Check `image_key`, and take all cameras where it is None.
+        """Check `image_key`, and take all cameras where it is None; the others are no input any more.
 
         Raises:
             ValueError: There is no camera, one is unknown or repeated, or they differ in their number of channels.
@@ -67,6 +67,9 @@ class ImagePolicyConfig(PreTrainedConfig):
                 "--policy.image_key to cameras that have equally many, separated by commas."
             )
         self.image_key = ",".join(chosen)
+        self.input_features = {
+            key: feature for key, feature in self.input_features.items() if key in chosen or key not in known
+        }
 
 
 def stack_images(images: Sequence[Tensor], size: tuple[int, int]) -> Tensor:

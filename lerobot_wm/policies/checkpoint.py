@@ -7,7 +7,7 @@ from typing import Any
 import draccus
 from huggingface_hub import hf_hub_download
 from huggingface_hub.constants import CONFIG_NAME
-from huggingface_hub.errors import EntryNotFoundError
+from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 from lerobot.configs import PreTrainedConfig
 from safetensors import SafetensorError, safe_open
 
@@ -26,7 +26,7 @@ def checkpoint_file(
         **hub: Further options of `hf_hub_download`.
 
     Raises:
-        FileNotFoundError: The folder is behind a link that leads nowhere.
+        FileNotFoundError: The folder is behind a link that leads nowhere, or the Hub cannot be reached.
     """
     path = Path(checkpoint) / name
     if Path(checkpoint).is_dir():
@@ -34,6 +34,8 @@ def checkpoint_file(
     refuse_broken_link(Path(checkpoint))
     try:
         return Path(hf_hub_download(str(checkpoint), name, revision=revision, **hub))
+    except LocalEntryNotFoundError:  # an EntryNotFoundError, too: the Hub was not asked
+        raise
     except EntryNotFoundError:
         return None
 

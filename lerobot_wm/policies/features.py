@@ -59,9 +59,20 @@ def image_keys(features: dict[str, PolicyFeature]) -> list[str]:
 
 
 def renamed(features: Mapping[str, PolicyFeature], rename_map: Mapping[str, str]) -> dict[str, PolicyFeature]:
-    """The features of a dataset or environment under the names that `--rename_map` gives them."""
-    kept = {key: feature for key, feature in features.items() if key not in rename_map}
-    return kept | {new: features[old] for old, new in rename_map.items() if old in features}
+    """The features of a dataset or environment under the names that `--rename_map` gives them.
+
+    Raises:
+        ValueError: Two would have one name: which of them is read would depend on their order.
+    """
+    names = {old: rename_map.get(old, old) for old in features}
+    for old, new in names.items():
+        others = [key for key, name in names.items() if name == new and key != old]
+        if others:
+            raise ValueError(
+                f"--rename_map: '{old}' and '{others[0]}' would both be '{new}'. Give the one that is not to be read "
+                "another name as well."
+            )
+    return {names[old]: feature for old, feature in features.items()}
 
 
 def names_before(keys: Iterable[str], rename_map: Mapping[str, str]) -> list[str]:

@@ -1,6 +1,8 @@
 """Training that goes on from a checkpoint, on the same dataset or another one."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -8,16 +10,25 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import ACTION
 from lerobot_wm.policies.cameras import ImagePolicyConfig
-from lerobot_wm.policies.features import image_keys, renamed
+from lerobot_wm.policies.features import OWN_NAMES, image_keys, renamed
 from lerobot_wm.policies.iql_config import IQLConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 
+_RENAME_MAP: ContextVar[Mapping[str, str]] = ContextVar("rename_map", default=OWN_NAMES)
+
+
+@contextmanager
+def names_given_by(rename_map: Mapping[str, str]) -> Iterator[None]:
+    """Have policies that are made here know `--rename_map`, of which LeRobot tells its processors alone."""
+    token = _RENAME_MAP.set(rename_map)
+    try:
+        yield
+    finally:
+        _RENAME_MAP.reset(token)
+
 
 def fit_to_dataset(
-    config: ImagePolicyConfig,
-    saved: ImagePolicyConfig,
-    dataset_meta: LeRobotDatasetMetadata,
-    rename_map: Mapping[str, str],
+    config: ImagePolicyConfig, saved: ImagePolicyConfig, dataset_meta: LeRobotDatasetMetadata
 ) -> None:
     """Check that a checkpoint can be trained on a dataset, and have it expect the dataset's cameras.
 
@@ -27,13 +38,13 @@ def fit_to_dataset(
     Args:
         config: The configuration to train with; changed in place. LeRobot has given it the dataset's actions.
         saved: As it is in the checkpoint.
-        dataset_meta: The dataset to train on.
-        rename_map: New names of its features, where they are known. Cameras of one size need none: LeRobot's own
-            training tells a policy of no names.
+        dataset_meta: The dataset to train on, with new names of its features inside `names_given_by`. Cameras of one
+            size need none.
 
     Raises:
         ValueError: A size differs; names both.
     """
+    rename_map = _RENAME_MAP.get()
     check_sizes(
         saved,
         (*saved.features_read, ACTION),
@@ -46,16 +57,8 @@ def fit_to_dataset(
     shapes = {features[key].shape for key in image_keys(features)}  # none of a latent dataset
     if len(shapes) == 1:
         config.input_features |= {key: PolicyFeature(FeatureType.VISUAL, *shapes) for key in saved.cameras}
-    fit_cameras(config, dataset_meta, rename_map)
-
-
-def fit_cameras(
-    config: ImagePolicyConfig, dataset_meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]
-) -> None:
-    """Have a policy expect its cameras in the size that they have in a dataset, as far as they are found there."""
-    features = renamed(dataset_to_policy_features(dataset_meta.features), rename_map)
-    for key in set(config.cameras) & features.keys():
-        config.input_features[key] = features[key]
+    known = renamed(features, rename_map)
+    config.input_features |= {key: known[key] for key in saved.cameras if key in known}
 
 
 def check_sizes(
@@ -91,14 +94,14 @@ def check_sizes(
 
 
 def check_kept(config: PreTrainedConfig, saved: PreTrainedConfig) -> None:
-    """Refuse to change what a checkpoint holds: a policy's world model, and the β of its actors.
+    """Refuse to change what a checkpoint holds: its cameras, its world model, and the β of its actors.
 
     Args:
         config: The configuration to act or train with.
         saved: As it is in the checkpoint.
 
     Raises:
-        ValueError: A setting names another world model, or a β without an actor.
+        ValueError: A setting names other cameras, another world model, or a β without an actor.
     """
     anew = f"train a new {saved.type}, --policy.type={saved.type} in place of --policy.path"
     both_on_latents = isinstance(saved, LatentPolicyConfig) and isinstance(config, LatentPolicyConfig)
@@ -106,6 +109,13 @@ def check_kept(config: PreTrainedConfig, saved: PreTrainedConfig) -> None:
         raise ValueError(
             f"--policy.world_model_path={config.world_model_path}: the policy of --policy.path has its world model in "
             f"it, {saved.world_model_path}, and was fitted to it. Leave the flag out, or {anew}."
+        )
+    both_see = isinstance(saved, ImagePolicyConfig) and isinstance(config, ImagePolicyConfig)
+    if both_see and [key.strip() for key in config.cameras] != saved.cameras:
+        raise ValueError(
+            f"--policy.image_key={config.image_key}: the {saved.type} of --policy.path was fitted to "
+            f"{saved.image_key or 'no camera'}, in this order. Leave the flag out, give these names to other cameras "
+            f"by --rename_map, or {anew}."
         )
     if isinstance(saved, IQLConfig) and isinstance(config, IQLConfig):
         untrained = [beta for beta in config.sweep_betas if beta not in saved.trained_betas]

@@ -16,7 +16,7 @@ from lerobot_wm.envs.tasks import resolve_tasks, task_description
 from lerobot_wm.policies.cameras import ImagePolicyConfig, check_observation
 from lerobot_wm.policies.checkpoint import read_config
 from lerobot_wm.policies.features import names_before, renamed
-from lerobot_wm.policies.fine_tuning import check_kept, check_sizes, fit_to_dataset
+from lerobot_wm.policies.fine_tuning import check_kept, check_sizes, fit_to_dataset, names_given_by
 from lerobot_wm.policies.iql_agent import end_column
 from lerobot_wm.policies.iql_config import IQLConfig
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
@@ -53,7 +53,8 @@ def check_dataset_fits(
     if OBS_LATENT not in dataset_meta.features:
         cameras = [rename_map.get(key, key) for key in dataset_meta.camera_keys]
         _check_cameras(saved, cameras, dataset_meta.repo_id)
-    fit_to_dataset(deepcopy(config), saved, dataset_meta, rename_map)
+    with names_given_by(rename_map):
+        fit_to_dataset(deepcopy(config), saved, dataset_meta)
 
 
 def check_encoder_fits(

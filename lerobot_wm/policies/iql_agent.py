@@ -2,28 +2,30 @@
 
 from typing import Any
 
+import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.constants import OBS_STR
 from torch import Tensor, nn
 
 from lerobot_wm.constants import DONE, SUCCESS
-from lerobot_wm.policies.iql_config import IQLConfig
+from lerobot_wm.policies.iql_config import NEVER, IQLConfig
 from lerobot_wm.policies.parts import logged
 from lerobot_wm.policies.rewards import FrameLabel, reward_columns
 from lerobot_wm.rl.agent import IQLAgent
 
 
-def make_agent(config: IQLConfig, observation_dim: int) -> IQLAgent:
+def make_agent(config: IQLConfig, observation_dim: int, *, anew: bool) -> IQLAgent:
     """The agent of a policy, its actors' betas noted in `config` when the policy is made new.
 
     Args:
         config: The policy's configuration.
         observation_dim: O, the size of the heads' input.
+        anew: Whether the policy is made new, though its settings may be those of another.
 
     Raises:
         ValueError: No actor was trained with `config.beta`.
     """
-    if not config.trained_betas:
+    if anew or not config.trained_betas:
         config.trained_betas = list(dict.fromkeys([config.beta, *config.sweep_betas]))
     if config.beta not in config.trained_betas:
         raise ValueError(
@@ -46,7 +48,7 @@ def make_agent(config: IQLConfig, observation_dim: int) -> IQLAgent:
 class Outcomes(nn.Module):
     """What came of an action, in training: its reward, and whether it ended the task.
 
-    A task ends where the configuration's `done_key` is true.
+    A task ends where the configuration's `done_key` is true, and nowhere where that is `NEVER`.
 
     Args:
         config: The policy's configuration.
@@ -60,15 +62,19 @@ class Outcomes(nn.Module):
         super().__init__()
         end = DONE if dataset_meta is None else end_column(config, dataset_meta)
         self.reward = FrameLabel(config.reward_key, dataset_meta)
-        self.end = FrameLabel(end, dataset_meta)
+        self.end = None if end is None else FrameLabel(end, dataset_meta)
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Rewards (B,) and ends (B,) bool."""
-        return self.reward(batch).flatten(), self.end(batch).flatten().bool()
+        reward = self.reward(batch).flatten()
+        end = torch.zeros_like(reward) if self.end is None else self.end(batch).flatten()
+        return reward, end.bool()
 
 
-def end_column(config: IQLConfig, dataset_meta: LeRobotDatasetMetadata) -> str:
-    """The column that tells where a task ends; a dataset without it, or without the reward, is refused.
+def end_column(config: IQLConfig, dataset_meta: LeRobotDatasetMetadata) -> str | None:
+    """The column that tells where a task ends, None where it never does.
+
+    A dataset without the column, or without the reward, is refused.
 
     Raises:
         ValueError: The dataset lacks the reward, or does not tell where a task ends.
@@ -76,7 +82,8 @@ def end_column(config: IQLConfig, dataset_meta: LeRobotDatasetMetadata) -> str:
     features, known = dataset_meta.features, reward_columns(dataset_meta)
     end = config.done_key or (DONE if DONE in features else SUCCESS)
     missing = [] if config.reward_key in known else [config.reward_key]
-    missing += [] if end in {*known, DONE} & features.keys() else [config.done_key or f"{DONE} or {SUCCESS}"]
+    told = end == NEVER or end in {*known, DONE} & features.keys()
+    missing += [] if told else [config.done_key or f"{DONE} or {SUCCESS}"]
     if missing:
         choice = f"set --policy.reward_key or done_key to one of {', '.join(known)}, " if known else ""
         raise ValueError(
@@ -84,7 +91,7 @@ def end_column(config: IQLConfig, dataset_meta: LeRobotDatasetMetadata) -> str:
             f"{choice}add what is missing to the dataset, or train "
             f"--policy.type={config.type.replace('iql', 'bc')}, which needs none."
         )
-    return end
+    return None if end == NEVER else end
 
 
 def batch_loss(

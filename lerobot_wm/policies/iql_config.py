@@ -6,6 +6,8 @@ from lerobot_wm.policies.multi_task_config import MultiTaskConfig
 from lerobot_wm.policies.optim import ActorCosineConfig
 from lerobot_wm.policies.rewards import RewardConfig
 
+NEVER = "never"  # for `done_key`
+
 
 @dataclass
 class IQLConfig(RewardConfig, MultiTaskConfig):
@@ -24,7 +26,9 @@ class IQLConfig(RewardConfig, MultiTaskConfig):
         target_rate: Polyak rate of the target critics.
         done_key: The dataset's column that is true where an action ended the task, not where time ran out. None takes
             next.done or, in a dataset without it, next.success. LeRobot's own recorders set next.done at a time limit,
-            too: next.success for these, or next.reward where there is none and the reward is 0/1.
+            too: next.success for these, or next.reward where there is none and the reward is 0/1. "never": no action
+            ends it. A reward that is above zero on the way needs this: what ends such a task costs all that would have
+            come, and a policy learns to put success off.
         trained_betas: β of every actor, the main one first; filled when the policy is made.
     """
 

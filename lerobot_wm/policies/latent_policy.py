@@ -33,7 +33,8 @@ class LatentPolicy(MultiTaskPolicy):
         dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
-        world_model = take_world_model(config) if config.use_latent else None
+        anew = dataset_stats is not None
+        world_model = take_world_model(config, anew=anew) if config.use_latent else None
         config.input_features = deployed_features(config)
         if config.use_latent and dataset_meta is not None:  # to be trained
             check_latents(config, dataset_meta)
@@ -166,9 +167,11 @@ class LatentPolicy(MultiTaskPolicy):
         if self._prev_action is None or self._prev_action.shape[0] != images.shape[0]:
             self._filter_state = None
             self._prev_action = images.new_zeros(images.shape[0], self.config.action_dim)
-        states = self.world_model.observe(
-            images[:, None], self._prev_action[:, None], self._filter_state, batch[OBS_STATE][:, None]
-        )
+        # At full precision, whatever evaluates: the latents that the policy was trained on are so, too.
+        with torch.autocast(images.device.type, enabled=False):
+            states = self.world_model.observe(
+                images[:, None], self._prev_action[:, None], self._filter_state, batch[OBS_STATE][:, None]
+            )
         self._filter_state = states.last()
         if self.config.save_predicted_video:
             expected = self.world_model.expected_images(self._filter_state)

@@ -16,15 +16,19 @@ from lerobot_wm.world_model.interface import LatentModel
 _MIN_LATENT_STD = 1e-5  # below it, scaling latents to unit variance would scale rounding errors
 
 
-def take_world_model(config: LatentPolicyConfig) -> LatentModel:
+def take_world_model(config: LatentPolicyConfig, *, anew: bool) -> LatentModel:
     """The world model of a policy: that of its path where the policy is new, one to be filled with weights else.
 
     A new policy's `config` is told which it is, and of its cameras.
 
+    Args:
+        config: The policy's.
+        anew: Whether nothing will fill it: the policy is new, even where its settings are another's, which name one.
+
     Raises:
         ValueError: `world_model_path` is not given, or is no checkpoint with a world model.
     """
-    if config.world_model is not None:
+    if config.world_model is not None and not anew:
         return get_policy_class(config.world_model.type)(config.world_model).world_model
     if config.world_model_path is None:
         raise ValueError(

@@ -33,7 +33,8 @@ class MultiTaskPolicy(StrictPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config)
-        if dataset_meta is not None and not config.tasks:  # made new, not loaded from a checkpoint
+        # Made new, not loaded from a checkpoint: its settings may be those of another policy, tasks and all.
+        if dataset_meta is not None and (dataset_stats is not None or not config.tasks):
             config.tasks = [str(task) for task in dataset_meta.tasks.index]
         config.validate_features()
         self.state_scaling = Affine(config.state_dim)

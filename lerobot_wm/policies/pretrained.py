@@ -14,7 +14,6 @@ from safetensors import SafetensorError
 
 from lerobot_wm.hub.model_card import TrainingData, model_card
 from lerobot_wm.policies.checkpoint import WHOLE, not_finite, read_config
-from lerobot_wm.policies.features import OWN_NAMES
 from lerobot_wm.policies.fine_tuning import check_action_size, check_kept, fit_to_dataset
 from lerobot_wm.policies.networks import check_networks
 from lerobot_wm.policies.world_model_config import WorldModelConfig
@@ -75,7 +74,7 @@ class StrictPolicy(PreTrainedPolicy):
         if dataset_meta is None:
             check_action_size(config, saved)
         else:
-            fit_to_dataset(config, saved, dataset_meta, OWN_NAMES)  # LeRobot tells a policy of no others
+            fit_to_dataset(config, saved, dataset_meta)
             kwargs["dataset_meta"] = dataset_meta
         return super().from_pretrained(pretrained_name_or_path, config=config, strict=strict, **kwargs)
 

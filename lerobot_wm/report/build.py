@@ -17,7 +17,7 @@ from lerobot_wm.report.inline import PNG, SVG, data_uri, figure_bytes
 from lerobot_wm.report.latents import latent_figures, latent_map
 from lerobot_wm.report.open_loop import load_world_model, open_loop, strips_figure
 from lerobot_wm.report.page import Page, page_of_records
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.report.provenance import by_machine, provenance
 from lerobot_wm.report.quality_page import quality_section
 from lerobot_wm.report.records import find_records, read_records
 from lerobot_wm.report.tables import markdown_table, terminal_tables
@@ -85,7 +85,7 @@ def report(cfg: ReportConfig) -> Path:
     evaluations = [read_evaluation(folder) for folder in _paths(cfg.videos)]
     clips = [clip for evaluation in evaluations for clip in evaluation.clips]
     page = page_of_records(cfg.title, records, clips)
-    page.commands = [*(evaluation.command for evaluation in evaluations), provenance()["command"]]
+    page.made_by = by_machine([*(evaluation.provenance for evaluation in evaluations), provenance()])
     curves = curve_figures(read_logs(_paths(cfg.train_logs)))
     page.curves = [data_uri(figure_bytes(figure, SVG), SVG) for figure in curves]
     if cfg.quality is not None:
@@ -94,8 +94,11 @@ def report(cfg: ReportConfig) -> Path:
         page.data = summarise_data(meta, cfg.dataset.root)
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     if meta is not None and policy is not None:
-        picture = _show_world_model(page, policy, meta, cfg.dataset.root)
-        (cfg.output_dir / "open_loop.png").write_bytes(picture)
+        _show_world_model(page, policy, meta, cfg.dataset.root)
+        if page.open_loop:
+            picture = figure_bytes(strips_figure(page.open_loop), PNG)
+            page.strips = data_uri(picture, PNG)
+            (cfg.output_dir / "open_loop.png").write_bytes(picture)
 
     tables = [*page.tables, page.paper_table, *page.comparison_tables]
     shown = [table for table in tables if table is not None]
@@ -110,16 +113,13 @@ def report(cfg: ReportConfig) -> Path:
 
 def _show_world_model(
     page: Page, policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, root: str | None
-) -> bytes:
-    """Put on the page what a world model imagines of a dataset and knows of it; returns the strips as a PNG file."""
+) -> None:
+    """Put on the page what a world model imagines of a dataset and knows of it."""
     page.dataset = meta.repo_id
     page.open_loop = open_loop(policy, meta.repo_id, root)
-    picture = figure_bytes(strips_figure(page.open_loop), PNG)
-    page.strips = data_uri(picture, PNG)
     page.dreams = dream_clips(policy, meta, root)
     page.latents = latent_map(policy, meta, root)
     page.latent_pictures = [data_uri(figure_bytes(f, PNG), PNG) for f in latent_figures(page.latents)]
-    return picture
 
 
 def _paths(comma_separated: str | None) -> list[Path]:

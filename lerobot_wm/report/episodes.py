@@ -4,13 +4,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch import Tensor
 
-from lerobot_wm.constants import ACTION
+from lerobot_wm.constants import ACTION, TASK
+from lerobot_wm.data.resize import resize_images
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+
+_FRAMES_AT_ONCE = 64  # read and then made small: bounds memory for long episodes of large images
 
 
 def shapes_read(policy: WMRSSMPolicy | LatentPolicy) -> dict[str, tuple[int, ...]]:
@@ -78,14 +83,14 @@ def read_episodes(
         revision: Of a dataset on the Hub.
 
     Yields:
-        What the policy reads of T frames: each camera (T, C, H, W) in [0, 1], `action` (T, A) and the others of
-        `shapes_read` (T, ·); the model's reward (T,) where the dataset has that column; `task`.
+        What the policy reads of T frames: each camera (T, C, H, W) in [0, 1] at the model's image size, `action` (T, A)
+        and the others of `shapes_read` (T, ·); the model's reward (T,) where the dataset has that column; `task`, the
+        one that `episodes_by_task` counts it under.
     """
     keys = [*shapes_read(policy), *({reward_key(policy)} & meta.features.keys())]
     all_lengths = meta.episodes["length"][:]
     lengths = [all_lengths[episode] for episode in episodes]
-    n_frames = min(max(lengths), max_frames or max(lengths))
-    times = [step / meta.fps for step in range(n_frames)]
+    times = [step / meta.fps for step in range(min(max(lengths), _FRAMES_AT_ONCE))]
     dataset = LeRobotDataset(
         meta.repo_id,
         root=root,
@@ -93,8 +98,17 @@ def read_episodes(
         episodes=episodes,
         delta_timestamps=dict.fromkeys(keys, times),
     )
+    tasks = meta.episodes["tasks"][:]
     start = 0  # among the frames of these episodes
-    for length in lengths:
-        window = dataset[start]  # beyond its end an episode's last frame is repeated
-        yield window | {key: window[key][:length] for key in keys}
+    for episode, length in zip(episodes, lengths, strict=True):
+        stop = min(length, max_frames or length)
+        parts: dict[str, list[Tensor]] = {key: [] for key in keys}
+        for position in range(0, stop, len(times)):
+            window = dataset[start + position]  # beyond its end an episode's last frame is repeated
+            for key in keys:
+                part = window[key][: stop - position]
+                if key in policy.config.cameras:
+                    part = resize_images(part, policy.config.image_size)
+                parts[key].append(part)
+        yield {key: torch.cat(of_key) for key, of_key in parts.items()} | {TASK: tasks[episode][0]}
         start += length

@@ -1,5 +1,6 @@
 """Open-loop prediction: the world model sees five frames, then imagines from actions alone."""
 
+import logging
 import math
 from dataclasses import dataclass
 from textwrap import fill
@@ -19,6 +20,8 @@ from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.episodes import episodes_by_task, shapes_read
 from lerobot_wm.world_model.model import WorldModel
+
+logger = logging.getLogger(__name__)
 
 CONTEXT = 5  # frames the model sees
 HORIZONS = (1, 5, 10, 20, 45)  # frames ahead of the last one it saw
@@ -59,15 +62,12 @@ def load_world_model(path: str) -> WMRSSMPolicy | LatentPolicy:
 
 
 def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | None) -> list[OpenLoop]:
-    """Predict the last episodes of each task (those LeRobot's `eval_split` holds out).
-
-    Raises:
-        ValueError: no episode is long enough.
-    """
+    """Predict the last episodes of each task (those LeRobot's `eval_split` holds out); none where all are shorter."""
     meta = LeRobotDatasetMetadata(repo_id, root=root)
     by_task = episodes_by_task(meta, min_length=WINDOW)
     if not by_task:
-        raise ValueError(f"{repo_id} has no episode of {WINDOW} frames, which open-loop prediction needs.")
+        logger.warning("%s has no episode of %d frames, which open-loop prediction needs.", repo_id, WINDOW)
+        return []
     first_frame = meta.episodes["dataset_from_index"][:]
     times = [step / meta.fps for step in range(WINDOW)]
     dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(shapes_read(policy), times))

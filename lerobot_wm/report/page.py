@@ -10,7 +10,6 @@ from lerobot_wm.report.inline import SVG, data_uri, figure_bytes
 from lerobot_wm.report.latents import LatentMap
 from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, OpenLoop
 from lerobot_wm.report.outcomes import OutcomeGrid, outcome_grids
-from lerobot_wm.report.provenance import provenance
 from lerobot_wm.report.records import Record
 from lerobot_wm.report.split_figure import split_figure
 from lerobot_wm.report.statistics import SuccessRate, in_split
@@ -38,12 +37,11 @@ class Page:
     paper_table: ReportTable | None
     comparison_tables: list[ReportTable]
     grids: list[OutcomeGrid]
-    provenance: dict[str, str]
     split_picture: str = ""  # data URI
     featured: list[Clip] = field(default_factory=list)  # shown before all others
     n_clips: tuple[int, int] = (0, 0)  # videos on the page, videos there were
     video_megabytes: int = 0  # the limit on all videos together
-    commands: list[str] = field(default_factory=list)
+    made_by: list[tuple[list[str], dict[str, str]]] = field(default_factory=list)  # see `by_machine`
     data: DataSummary | None = None
     dataset: str = ""  # repo id of the dataset that the world model imagines and knows
     dreams: list[DreamClip] = field(default_factory=list)
@@ -61,7 +59,7 @@ class Page:
             "data": "What was trained, and on what",
             "success": "How well it works",
             "videos": "Watch it",
-            "imagination": "What the world model imagines" if self.open_loop else "",
+            "imagination": "What the world model imagines" if self.open_loop or self.dreams else "",
             "knowledge": "What the world model knows" if self.latents or self.quality else "",
             "training": "How training went" if self.curves else "",
             "provenance": "How to make it again",
@@ -94,7 +92,6 @@ def page_of_records(title: str, records: list[Record], clips: list[Clip]) -> Pag
         featured=_featured(inlined),
         n_clips=(len(inlined), len(clips)),
         video_megabytes=MAX_VIDEO_BYTES // 1_000_000,
-        provenance={name: fact for name, fact in provenance().items() if name != "command"},
     )
     if len(present_splits(records)) > 1:
         page.split_picture = data_uri(figure_bytes(split_figure(records), SVG), SVG)

@@ -10,13 +10,23 @@ import torch
 
 from lerobot_wm.cores import cpu_kind, usable_cores
 
+COMMAND = "command"
 PACKAGES = ("lerobot_policy_wm", "lerobot", "torch", "mujoco", "metaworld", "gymnasium", "numpy")
+
+
+def by_machine(results: list[dict[str, str]]) -> list[tuple[list[str], dict[str, str]]]:
+    """The commands of some results with what they share: versions and kind of machine."""
+    found: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    for facts in results:
+        shared = tuple((name, fact) for name, fact in facts.items() if name != COMMAND)
+        found.setdefault(shared, []).append(facts[COMMAND])
+    return [(commands, dict(shared)) for shared, commands in found.items()]
 
 
 def provenance() -> dict[str, str]:
     """What produced a result in this process: name -> value."""
     command = f"{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}"
-    facts = {"command": command, "python": platform.python_version()}
+    facts = {COMMAND: command, "python": platform.python_version()}
     facts |= {package: version(package) for package in PACKAGES}
     facts["system"] = f"{platform.system()} {platform.machine()}"
     facts["CPU"] = cpu_kind()

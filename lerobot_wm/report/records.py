@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable
 from glob import glob
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, NotRequired, TypedDict
 
 # "return" is a Python keyword, hence the functional form.
 Record = TypedDict(
@@ -20,9 +20,11 @@ Record = TypedDict(
         "success": bool,
         "steps": int,  # environment steps until the episode ended
         "return": float,  # sum of rewards over those steps
+        "variation_set": NotRequired[
+            int | None
+        ],  # Meta-World: the set of the variation; older records lack it
     },
 )
-RECORD_KEYS = frozenset(Record.__annotations__)
 
 
 def record_line(record: Record) -> str:
@@ -50,12 +52,12 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
 
     Raises:
         ValueError: when a line is not a record, when a rollout occurs twice, when one arm has two presets, when a
-            variation is seen here and unseen there, or when there is no record at all.
+            variation is of another set here than there, or when there is no record at all.
     """
     records: list[Record] = []
     origins: dict[tuple, str] = {}
     presets: dict[str, str] = {}
-    seen: dict[tuple[str, int], tuple[bool | None, str]] = {}
+    positions: dict[tuple[str, int, str], tuple[Any, str]] = {}
     for path in paths:
         for number, line in enumerate(path.read_text().splitlines(), start=1):
             record = _parse(line, where=f"{path}:{number}")
@@ -72,15 +74,19 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
                     f"{path}:{number}: arm '{record['arm']}' has preset '{record['preset']}' here, '{preset}' before. "
                     "The seeds of an arm are pooled: report the presets apart, or evaluate under another --arm."
                 )
-            first_seen, origin = seen.setdefault(
-                (record["task"], record["variation"]), (record["seen"], origins[rollout])
-            )
-            if first_seen is not record["seen"]:
-                raise ValueError(
-                    f"{path}:{number}: variation {record['variation']} of {record['task']} has seen {record['seen']} "
-                    f"here, {first_seen} at {origin}: positions of different sets (--env.variation_set), which "
-                    "cannot be compared one by one. Report each set apart."
+            for name in ("seen", "variation_set"):
+                if name not in record:
+                    continue
+                fact = record[name]
+                first, origin = positions.setdefault(
+                    (record["task"], record["variation"], name), (fact, origins[rollout])
                 )
+                if first != fact:
+                    raise ValueError(
+                        f"{path}:{number}: variation {record['variation']} of {record['task']} has {name} {fact} "
+                        f"here, {first} at {origin}: positions of different sets (--env.variation_set), which "
+                        "cannot be compared one by one. Report each set apart."
+                    )
             records.append(record)
     if not records:
         raise ValueError("The records files are empty: run `lerobot-wm eval` first.")
@@ -100,7 +106,8 @@ def _parse(line: str, where: str) -> Record:
         record: Record = json.loads(line)
     except json.JSONDecodeError as error:
         raise ValueError(f"{where} is not JSON ({error}): expected one record per line.") from error
-    if not isinstance(record, dict) or set(record) != RECORD_KEYS:
+    expected = Record.__required_keys__
+    if not isinstance(record, dict) or set(record) - Record.__optional_keys__ != expected:
         found = sorted(record) if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f"{where} is not a record: found {found}, expected the keys {sorted(RECORD_KEYS)}.")
+        raise ValueError(f"{where} is not a record: found {found}, expected the keys {sorted(expected)}.")
     return record

@@ -14,6 +14,7 @@ from lerobot_wm.report.statistics import SPLITS, SuccessRate, in_split, success_
 
 # What a terminal of 100 columns holds beside the longest label.
 FULL_COLUMNS, COMPACT_COLUMNS = 3, 6
+SEEN = "Seen variations are those that demonstrations are collected on by default, 0-9 of set 42."
 WILSON = "Successes/rollouts, per cent, [Wilson 95% interval over rollouts]."
 
 Cell = SuccessRate | Estimate | str | int | None
@@ -40,7 +41,8 @@ def table_by_split(title: str, records: list[Record]) -> ReportTable:
     splits = present_splits(records)
     rows = [(task, cells(of_task)) for task, of_task in by_task(records).items()]
     rows.append(("all tasks", cells(records)))
-    return ReportTable(title, "task", list(splits), rows, n_totals=1, notes=[WILSON])
+    notes = [WILSON, SEEN] if "seen" in splits else [WILSON]
+    return ReportTable(title, "task", list(splits), rows, n_totals=1, notes=notes)
 
 
 def present_splits(records: Iterable[Record]) -> tuple[str, ...]:

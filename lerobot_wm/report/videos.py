@@ -36,9 +36,9 @@ class Clip:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What the page shows of one `lerobot-wm eval`: its command and its videos."""
+    """What the page shows of one `lerobot-wm eval`: what made it, its command among that, and its videos."""
 
-    command: str
+    provenance: dict[str, str]
     clips: list[Clip]
 
 
@@ -61,7 +61,7 @@ def read_evaluation(folder: Path) -> Evaluation:
                 f"{video} is not named as `lerobot-wm eval` names videos: remove it from {folder}."
             )
         clips.append(Clip(info["arm"], video.parent.name, int(name[1]), name[2] == "success", video))
-    return Evaluation(info["provenance"]["command"], clips)
+    return Evaluation(info["provenance"], clips)
 
 
 def within_limit(clips: list[Clip]) -> list[Clip]:

@@ -1,9 +1,12 @@
 """Frames decoded by several processes at once."""
 
+import os
 from multiprocessing import get_context
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
+
+import pytest
 
 from lerobot_wm.data.cache import CameraCache
 
@@ -35,3 +38,13 @@ def test_processes_that_start_together_share_one_file(tmp_path: Path) -> None:
         process.join()
     assert seen == [PROCESSES] * (PROCESSES * ROUNDS)
     assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_file_systems_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_links(source: Path, target: Path) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_links)
+    CameraCache._open(tmp_path / "frames.npy", (3,))[:] = 7
+    assert CameraCache._open(tmp_path / "frames.npy", (3,)).tolist() == [7, 7, 7]
+    assert [path.name for path in tmp_path.iterdir()] == ["frames.npy"]

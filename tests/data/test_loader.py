@@ -61,6 +61,22 @@ def test_chosen_episodes_and_subset_equal_lerobots(demos_root: Path) -> None:
     assert_equal_batches(Subset(dataset, [3, 70, 9]), [0, 1, 2])
 
 
+def test_frames_that_lie_on_the_device_are_those_of_the_datasets_own_episodes(
+    demos_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a GPU, whose memory holds training and evaluation episodes once."""
+    monkeypatch.setattr(RamDataset, "_fit_on_device", lambda self: True)
+    monkeypatch.setattr("lerobot_wm.data.loader._COPIED_AT_ONCE", 50)
+    for episodes in ([1, 5], None):
+        dataset = LeRobotDataset(
+            "test/demos", root=demos_root, episodes=episodes, delta_timestamps=windows(3), return_uint8=True
+        )
+        assert_equal_batches(dataset, [0, 1, dataset.num_frames - 2, dataset.num_frames - 1])
+        frames = RamDataset(dataset, CPU)._cameras["observation.image"]
+        assert frames.shape == (dataset.num_frames, 64, 64, 3)
+        assert frames.dtype == torch.uint8
+
+
 def test_past_frames_and_uneven_deltas_equal_lerobots(demos_root: Path) -> None:
     deltas = {"observation.state": [-2 / 80, 0.0], "action": [0.0, 3 / 80]}
     dataset = LeRobotDataset("test/demos", root=demos_root, delta_timestamps=deltas, return_uint8=True)

@@ -107,6 +107,14 @@ def test_missing_gl_says_what_to_install() -> None:
     assert "apt-get install -y --no-install-recommends libegl1 libgl1" in result.stderr.splitlines()[-2]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL is Linux's")
+def test_a_display_elsewhere_is_not_drawn_on() -> None:
+    """As in `ssh -X`, where GLFW draws nothing."""
+    code = "from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv; MetaworldMTEnv('reach-v3').reset(seed=0)"
+    env = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    subprocess.run([sys.executable, "-c", code], check=True, env={**env, "DISPLAY": "localhost:10.0"})
+
+
 @pytest.mark.parametrize("camera", ["hand_top", "hand_side"])
 def test_hand_cameras_move_with_the_hand(make_env: MakeEnv, camera: str) -> None:
     env = make_env("reach-v3", camera_name=camera)

@@ -216,6 +216,22 @@ def test_training_does_not_write_over_checkpoints(
     assert digests(run) == before
 
 
+def test_going_on_from_an_earlier_last_removes_no_checkpoints(
+    world_model: tuple[Training, Path, list[str]], tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    """The later ones may be wanted, though the link was set back; a kill leaves one of them at most."""
+    run = shutil.copytree(world_model[1], tmp_path / "run", symlinks=True)
+    last = run / "checkpoints" / "last"
+    last.unlink()
+    last.symlink_to("000003")
+    shutil.copytree(run / "checkpoints" / "000006", run / "checkpoints" / "000009")
+    before = digests(run)
+    config = last / "pretrained_model" / "train_config.json"
+    with pytest.raises(FileExistsError, match=r"holds later checkpoints, 000006, 000009, .* from step 3"):
+        lerobot_wm_command(f"train --config_path={config} --resume=true --output_dir={run}")
+    assert digests(run) == before
+
+
 def test_a_training_without_a_checkpoint_begins_again(
     tmp_path: Path, lerobot_wm_command: Callable[..., None]
 ) -> None:

@@ -23,6 +23,8 @@ UNLIKE = {
     "states": {"observation.state": vector(9)},
     "cameras": {"observation.image": None, WRIST: camera(64, 64)},
     "rewards": {"next.reward": None, "next.done": None},
+    "two_cameras": {WRIST: camera(64, 64)},
+    "grey": {"observation.image": camera(64, 64, "video")},
     "no_actions": {"action": None, "observation.other": vector(4)},
 }
 TRAIN = f"train {TRAIN_FLAGS} --steps=1 --batch_size=2 --output_dir={{out}} {{data}} "
@@ -93,6 +95,46 @@ CASES = [
         "demos",
         GO_ON % "wm_bc" + " --policy.hidden_dims=[16] --policy.lr=0.001",
         "train: --policy.hidden_dims=[16] (the checkpoint's is [8]): other networks than",
+    ),
+    (
+        "demos",
+        GO_ON % "e2e_bc" + f" --policy.image_key={WRIST}",
+        f"--policy.image_key={WRIST}: the e2e_bc of --policy.path was fitted to observation.image, in this order. L",
+    ),
+    (
+        "two_cameras",
+        GO_ON % "e2e_bc" + f" --rename_map={{{{'{WRIST}':'observation.image'}}}}",
+        f"--rename_map: 'observation.image' and '{WRIST}' would both be 'observation.image'. Give",
+    ),
+    (
+        "two_cameras",
+        ENCODE % "wm_rssm" + f" --rename_map={{{{'{WRIST}':'observation.image'}}}}",
+        f"--rename_map: 'observation.image' and '{WRIST}' would both be 'observation.image'. Give",
+    ),
+    (
+        "demos",
+        TRAIN + "--policy.type=e2e_bc --env.type=metaworld_mt --env.task=reach-v3 --env.image_size=32",
+        "'observation.image' is (3, 32, 32), this policy was trained on (3, 64, 64) (C, H, W): set",
+    ),
+    (
+        "demos",
+        GO_ON % "e2e_bc" + " --env.type=metaworld_mt --env.task=mt6",
+        f"'Push and open a window']; this policy was trained on {list(TASKS)}. ",
+    ),
+    (
+        "grey",
+        TRAIN + "--policy.type=e2e_bc",
+        "test/grey has videos of 1 channels of observation.image; models here",
+    ),
+    (
+        "demos",
+        TRAIN + "--policy.type=e2e_bc --job.target=a10g-small",
+        "--job.target=a10g-small: lerobot-wm train trains on this machine, and a job",
+    ),
+    (
+        "demos",
+        TRAIN + "--policy.type=e2e_bc --sample_weighting.type=rabc",
+        "--sample_weighting.type=rabc: e2e_bc has one loss for a batch",
     ),
     ("demos", TRAIN + "--policy.type=wm_bc", "--policy.type=wm_bc needs --policy.world_model_path="),
     (
@@ -165,7 +207,9 @@ CASES = [
 def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LeRobotDataset]:
     """The demonstrations, and datasets that are unlike them, by name."""
     root = tmp_path_factory.mktemp("datasets")
-    return {name: record_demos(root / name, **changes) for name, changes in {"demos": {}, **UNLIKE}.items()}
+    made = {name: record_demos(root / name, **changes) for name, changes in {"demos": {}, **UNLIKE}.items()}
+    set_entry(root / "grey", "meta/info.json", ["features", "observation.image", "shape"], [64, 64, 1])
+    return made
 
 
 @pytest.fixture(scope="module")

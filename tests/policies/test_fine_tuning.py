@@ -288,6 +288,60 @@ def test_what_a_checkpoint_holds_cannot_be_changed(
             make_policy(config, ds_meta=dataset.meta)
 
 
+def test_a_new_training_with_the_settings_of_a_finished_one(
+    encoded: tuple,
+    known: LeRobotDataset,
+    other: LeRobotDataset,
+    tmp_path: Path,
+    lerobot_wm_command: Command,
+) -> None:
+    """They name the world model, whose weights are its checkpoint's; tasks and actors are the new one's own."""
+    path, encode = encoded
+    first = f"--policy.type=wm_iql --policy.world_model_path={path} {train_flags(known)}"
+    lerobot_wm_command(f"train {first} {SHORT} --output_dir={tmp_path / 'first'}")
+    settings = tmp_path / "first" / CHECKPOINT / "train_config.json"
+    latents = encode(other)
+    lerobot_wm_command(
+        f"train --config_path={settings} --seed=1 --policy.sweep_betas=[3] --dataset.root={latents.root}",
+        f"--output_dir={tmp_path / 'second'}",
+    )
+    second = load(tmp_path / "second" / CHECKPOINT)
+    assert second.config.tasks == ["Wave", "Push"]
+    assert second.config.trained_betas == [0.5, 3]
+    theirs = load_file(path / "model.safetensors")
+    for name, tensor in second.world_model.state_dict().items():
+        assert torch.equal(tensor, theirs[f"world_model.{name}"]), name
+
+
+@pytest.mark.parametrize("policy_type", ["wm_rssm", "e2e_bc"])
+def test_a_checkpoint_keeps_its_cameras(
+    policy_type: str, checkpoints: dict[str, Path], known: LeRobotDataset
+) -> None:
+    """In another order they would be shown to each other's filters."""
+    path = checkpoints[policy_type]
+    with pytest.raises(
+        ValueError, match=rf"image_key={WRIST},{FRONT}: .* fitted to {FRONT},{WRIST}, in this"
+    ):
+        make_policy(changed(path, image_key=f"{WRIST},{FRONT}"), ds_meta=known.meta)
+    same = make_policy(changed(path, image_key=f"{FRONT}, {WRIST}"), ds_meta=known.meta)
+    assert same.config.cameras == [FRONT, WRIST]
+
+
+def test_cameras_that_were_not_chosen_need_not_be_there_again(
+    known: LeRobotDataset, tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    lerobot_wm_command(
+        f"init --policy.type=wm_rssm {SMALL_WORLD_MODEL} --policy.device=cpu --policy.image_key={FRONT}",
+        f"--dataset.repo_id=test/recorded --dataset.root={known.root} --output_dir={tmp_path / 'wm'}",
+    )
+    front = {key: feature for key, feature in features().items() if key != WRIST}
+    dataset = record(
+        tmp_path / "dataset", {**front, "observation.images.side": camera(32, 32)}, [("Wave", 30)]
+    )
+    policy = go_on(tmp_path / "wm" / "pretrained_model", dataset)
+    assert [key for key in policy.config.input_features if "image" in key] == [FRONT]
+
+
 def changed(path: Path, **settings: Any) -> PreTrainedConfig:
     """The configuration of a checkpoint to go on from, with settings of `--policy.path`'s flags."""
     flags = [f"--{name.replace('__', '.')}={str(value).lower()}" for name, value in settings.items()]
@@ -472,3 +526,17 @@ def test_a_renamed_state_of_another_size_is_refused(
             f'--rename_map={{"observation.joints":"observation.state"}} --output_dir={tmp_path / "run"}',
         )
     assert not (tmp_path / "dataset.cache").exists()
+
+
+def test_a_state_that_is_given_its_name_is_the_one_that_counts(
+    checkpoints: dict[str, Path], tmp_path: Path, lerobot_wm_command: Command
+) -> None:
+    """The dataset has another one by that name, of another size, which gets another name itself."""
+    states = {"observation.state": vector(9), "observation.arm": vector(5)}
+    dataset = record(tmp_path / "dataset", {**features(), **states}, [("Wave", 6)])
+    names = {"observation.arm": "observation.state", "observation.state": "observation.all"}
+    lerobot_wm_command(
+        f"train --policy.path={checkpoints['wm_bc']} {SHORT} {train_flags(dataset)}",
+        f"--rename_map={json.dumps(names).replace(' ', '')} --output_dir={tmp_path / 'run'}",
+    )
+    assert load(tmp_path / "run" / CHECKPOINT).config.input_features["observation.state"].shape == (5,)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 import torchvision
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_policy
@@ -21,8 +21,9 @@ from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.pipeline.encode import encode_to_cache
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
+from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy
 from lerobot_wm.policies.frozen_backbone.weights import load_backbone_weights
-from lerobot_wm.policies.frozen_encoder import load_encoder
+from lerobot_wm.policies.frozen_encoder import encoder_fingerprint, load_encoder
 from lerobot_wm.policies.latent_setup import check_latents
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 from tests.recording import FRONT, WRIST, camera, record, vector
@@ -278,6 +279,19 @@ def test_features_of_several_cameras_stand_beside_each_other() -> None:
     assert features.shape == (1, 4, 2 * FEATURES)
     assert two.latent_dim == 2 * FEATURES
     torch.testing.assert_close(features, torch.cat([one.embed(left), one.embed(right)], dim=-1))
+
+
+def test_what_frames_were_resized_to_before_decides_the_features_too() -> None:
+    torch.manual_seed(0)
+    plain = FrozenBackbone("resnet18", 32)
+    before = {size: FrozenBackbone("resnet18", 32, frame_size=size) for size in ((32, 32), (16, 16))}
+    for backbone in before.values():
+        backbone.load_state_dict(plain.state_dict())
+    own = encoder_fingerprint(plain)
+    assert [encoder_fingerprint(backbone) == own for backbone in before.values()] == [True, False]
+    cameras = {"observation.image": PolicyFeature(FeatureType.VISUAL, (3, 48, 64))}
+    config = FrozenBackboneConfig(device="cpu", input_features=cameras, backbone_image_size=32)
+    assert FrozenBackbonePolicy(config).world_model.encoding_settings["frame_size"] == [48, 64]
 
 
 def test_features_of_another_image_size_or_camera_are_not_taken_for_ones_own(

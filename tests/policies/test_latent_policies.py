@@ -63,6 +63,20 @@ def test_step_by_step_latents_equal_the_encoded_ones(
         torch.testing.assert_close(latents, stored, atol=2e-5, rtol=2e-5)
 
 
+def test_the_filter_runs_at_the_precision_of_the_encoded_latents(
+    demos: LeRobotDataset, policy_paths: dict[str, Path]
+) -> None:
+    """Also where LeRobot's training evaluates, in the precision of training."""
+    policy = load(policy_paths, "wm_bc")
+    latents = []
+    for enabled in (False, True):
+        policy.reset()
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=enabled):
+            policy.select_action(frame(demos, 0))
+        latents.append(policy._filter_state.latent)
+    assert torch.equal(*latents)
+
+
 def test_latent_dataset_keeps_everything_but_the_images(demos: LeRobotDataset, latents_root: Path) -> None:
     encoded = LeRobotDataset("test/latents", root=latents_root)
     assert encoded.meta.camera_keys == []

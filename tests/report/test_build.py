@@ -82,7 +82,7 @@ def test_records_alone(
 def write_evaluation(folder: Path, *names: str) -> Path:
     """An output folder of `lerobot-wm eval` for arm wm_bc, with videos on reach-v3."""
     (folder / "videos" / "reach-v3").mkdir(parents=True)
-    info = {"arm": "wm_bc", "provenance": {"command": "lerobot-wm eval --arm=wm_bc"}}
+    info = {"arm": "wm_bc", "provenance": {"command": "lerobot-wm eval --arm=wm_bc", "GPU": "a large one"}}
     (folder / "eval_info.json").write_text(json.dumps(info))
     for name in names:
         frames = [np.full((64, 64, 3), 10 * i, np.uint8) for i in range(8)]
@@ -137,11 +137,38 @@ def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, 
         ("img", "data:image/svg+xml"),  # loss
     ], "everything is in the page, and nothing else is loaded"
     assert page.captions == ["reach-v3, wm_bc, variation 4: failure"]
-    assert "lerobot-wm eval --arm=wm_bc" in page.text
+    provenance = page.text.split("How to make it again")[-1]
+    assert re.search(r"lerobot-wm eval --arm=wm_bc\s+GPU\s*a large one\s", provenance), (
+        "where it was evaluated"
+    )
+    assert provenance.count("GPU") == 2, "and where the page was written"
     assert "The data: test/episodes" in page.text
     assert "116, 0.0 minutes at 80 frames per second" in page.text
     with Image.open(tmp_path / "report" / "open_loop.png") as picture:
         assert picture.width > 600
+
+
+def test_episodes_too_short_to_imagine_do_not_cost_the_report(
+    records_file: Path,
+    tmp_path: Path,
+    world_model_path: Path,
+    episodes_root: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("lerobot_wm.report.open_loop.WINDOW", 1000)
+    dataset = ReportDatasetConfig("test/episodes", str(episodes_root))
+    index = report(
+        ReportConfig(
+            records=str(records_file),
+            output_dir=tmp_path / "report",
+            world_model_path=str(world_model_path),
+            dataset=dataset,
+        )
+    )
+    page = Page(index)
+    assert "What the world model imagines" in page.headings, "dreams are of any length"
+    assert "Open-loop prediction" not in page.text
+    assert not (tmp_path / "report" / "open_loop.png").exists()
 
 
 def test_a_dataset_alone_is_described(records_file: Path, tmp_path: Path, episodes_root: Path) -> None:

@@ -17,6 +17,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, REWARD, SUCCESS, TASK
+from lerobot_wm.data.resize import resize_images
 from lerobot_wm.pipeline.dream import CheckpointConfig, DreamConfig, dream_of
 from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.policies.latent_policy import LatentPolicy
@@ -29,7 +30,7 @@ from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.dream import OWN_ACTIONS, TRUE_ACTIONS, ZERO_ACTIONS, Dreams, dream
 from lerobot_wm.report.dream_clips import dream_clips
 from lerobot_wm.report.dream_figures import STEPS_SHOWN, strip_figure, video_frames
-from lerobot_wm.report.episodes import reward_key
+from lerobot_wm.report.episodes import read_episodes, reward_key
 from lerobot_wm.report.open_loop import load_world_model
 from lerobot_wm.world_model.config import RSSMConfig
 from tests.report.quality_model import lively_world_model
@@ -138,6 +139,24 @@ def episode_of(root: Path, index: int) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def dreams(root: Path, checkpoints: dict[str, Path]) -> Dreams:
     return dream(load_world_model(str(checkpoints["wm_bc"])), episode_of(root, 1), CONTEXT)
+
+
+def test_episodes_are_read_some_frames_at_a_time_and_at_the_models_size(
+    root: Path, checkpoints: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, dataset = load_world_model(str(checkpoints["wm_rssm"])), LeRobotDataset("test/dream", root=root)
+    monkeypatch.setattr("lerobot_wm.report.episodes._FRAMES_AT_ONCE", 7)
+    first = 0
+    for episode, length in zip(
+        read_episodes(policy, dataset.meta, root, [0, 1, 2], 20), (9, 20, 3), strict=True
+    ):
+        frames = [dataset[first + t] for t in range(length)]
+        assert torch.equal(episode[ACTION], torch.stack([frame[ACTION] for frame in frames]))
+        for key in SIZES:
+            whole = resize_images(torch.stack([frame[key] for frame in frames]), (64, 64))
+            torch.testing.assert_close(episode[key], whole)
+        assert episode[TASK] == frames[0][TASK]
+        first += LENGTHS[frames[0]["episode_index"]]
 
 
 @pytest.mark.parametrize("policy_type", ["wm_bc", "wm_iql"])

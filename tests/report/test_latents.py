@@ -1,5 +1,6 @@
 """The map of the latent space, of real frames filtered by a world model that was made lively."""
 
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,19 @@ def test_each_point_has_its_task_and_its_time(latents: LatentMap, dataset: LeRob
         first = latents.points[(latents.task == task) & (latents.time == 0)]
         spread = np.linalg.norm(first[0] - first[1])
         assert spread < 0.05 * np.ptp(latents.points[:, 0])
+
+
+def test_episodes_of_several_tasks_are_counted_under_one(
+    dataset: LeRobotDataset, world_model_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot lists an episode's tasks in any order: the first of them need not be that of its first frame."""
+    policy, meta = load_world_model(str(world_model_path)), deepcopy(dataset.meta)
+    monkeypatch.setattr(
+        meta, "episodes", meta.episodes.map(lambda row: {"tasks": ["approach", *row["tasks"]]})
+    )
+    found = latent_map(policy, meta, dataset.root)
+    assert found.tasks == ["approach"]
+    assert set(found.task.tolist()) == {0}
 
 
 def test_long_episodes_are_read_to_a_bound(

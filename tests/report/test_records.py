@@ -74,3 +74,18 @@ def test_empty_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "records.jsonl").touch()
     with pytest.raises(ValueError, match="empty"):
         read_records([tmp_path / "records.jsonl"])
+
+
+def test_positions_of_sets_without_seen_ones_are_told_apart(make_records: Callable, tmp_path: Path) -> None:
+    """None of sets 43 and 44 is seen; records of before sets were noted are taken as they are."""
+    path = tmp_path / "records.jsonl"
+    unseen = [record | {"seen": False} for record in make_records("wm_bc", {"reach-v3": (1, 1)})]
+    arms = {set_: [r | {"arm": f"of_{set_}", "variation_set": set_} for r in unseen] for set_ in (43, 44)}
+    path.write_text("".join(map(record_line, unseen + arms[43])))
+    assert len(read_records([path])) == 100
+    path.write_text("".join(map(record_line, unseen + arms[43] + arms[44])))
+    with pytest.raises(
+        ValueError,
+        match=r"records\.jsonl:101: variation 0 of reach-v3 has variation_set 44 here, 43 at .*:51: positions",
+    ):
+        read_records([path])

@@ -32,7 +32,7 @@ class E2EIQLPolicy(E2EPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
-        self.agent = make_agent(config, self.observation_dim)
+        self.agent = make_agent(config, self.observation_dim, anew=dataset_stats is not None)
         self.outcomes = Outcomes(config, dataset_meta)
 
     def get_optim_params(self) -> dict:

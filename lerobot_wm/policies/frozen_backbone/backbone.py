@@ -26,14 +26,18 @@ class FrozenBackbone(LatentModel):
         name: A classification model of torchvision, or `timm/NAME` for one of timm.
         image_size: Height and width that images are resized to.
         n_cameras: Number of cameras, each encoded by itself.
+        frame_size: (H, W) of the images that it is given; None where that is its own.
 
     Raises:
         ValueError: There is no such model, or it takes no images of this size.
         ImportError: timm is asked for and not installed.
     """
 
-    def __init__(self, name: str, image_size: int, n_cameras: int = 1) -> None:
+    def __init__(
+        self, name: str, image_size: int, n_cameras: int = 1, frame_size: tuple[int, int] | None = None
+    ) -> None:
         super().__init__()
+        self.frame_size = frame_size or (image_size, image_size)
         self.name, self.image_size, self.n_cameras = name, image_size, n_cameras
         self.model = make_model(name)
         self.requires_grad_(False).eval()
@@ -41,8 +45,11 @@ class FrozenBackbone(LatentModel):
 
     @property
     def encoding_settings(self) -> dict[str, Any]:
-        """Networks that pool take any size of image, and see something else in each."""
-        return {"image_size": self.image_size}
+        """Networks that pool take any size of image, and see something else in each, and in what was smaller before."""
+        settings: dict[str, Any] = {"image_size": self.image_size}
+        if self.frame_size != (self.image_size, self.image_size):
+            settings["frame_size"] = list(self.frame_size)
+        return settings
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
         """Pooled features of K cameras' images (B, T, 3·K, H, W) in [0, 1], camera after camera: (B, T, F)."""

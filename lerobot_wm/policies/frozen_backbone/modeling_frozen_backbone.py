@@ -27,7 +27,9 @@ class FrozenBackbonePolicy(WorldModelPolicy):
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
         assert config.backbone_image_size is not None  # chosen by validate_features
-        self.world_model = FrozenBackbone(config.backbone, config.backbone_image_size, len(config.cameras))
+        self.world_model = FrozenBackbone(
+            config.backbone, config.backbone_image_size, len(config.cameras), config.image_size
+        )
         config.latent_dim = self.world_model.latent_dim
         is_new = dataset_meta is not None  # not loaded from a checkpoint, which has the weights in it
         if is_new and config.weights_path is not None:

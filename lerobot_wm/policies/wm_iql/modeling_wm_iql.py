@@ -27,7 +27,7 @@ class WMIQLPolicy(LatentPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
-        self.agent = make_agent(config, config.observation_dim)
+        self.agent = make_agent(config, config.observation_dim, anew=dataset_stats is not None)
         if config.compile_model:
             self.agent.loss = compiled(self.agent.loss)  # type: ignore[method-assign]
         self.outcomes = Outcomes(config, dataset_meta)

@@ -32,6 +32,8 @@ class WMRSSMPolicy(WorldModelPolicy):
         dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
+        if dataset_stats is not None:  # made new: settings of another world model hold its sizes
+            config.rssm.action_dim = config.rssm.image_channels = config.rssm.proprio_dim = 0
         made_new = config.rssm.action_dim == 0
         super().__init__(config, dataset_stats, dataset_meta)
         config.rssm.centred_start |= made_new
