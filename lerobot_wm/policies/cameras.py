@@ -67,9 +67,8 @@ class ImagePolicyConfig(PreTrainedConfig):
                 "--policy.image_key to cameras that have equally many, separated by commas."
             )
         self.image_key = ",".join(chosen)
-        self.input_features = {
-            key: feature for key, feature in self.input_features.items() if key in chosen or key not in known
-        }
+        for key in set(known) - set(chosen):
+            del self.input_features[key]
 
 
 def stack_images(images: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
