@@ -272,14 +272,14 @@ def test_what_jobs_made_is_not_removed_for_the_sake_of_something_else(
         lambda root: encode(policy, many_episodes, "test/latents", root, sample_seed=0),
     ):
         there(root)
-        shutil.rmtree(tmp_path / "latents.parts", ignore_errors=True)
         root.rename(tmp_path / "aside")
         encode_share(policy, many_episodes, root, Share(2, 2))
         (tmp_path / "aside").rename(root)
         with pytest.raises(FileExistsError, match="is there already"):
             encode(policy, many_episodes, "test/latents", root)
         assert len(list((tmp_path / "latents.parts").iterdir())) == 1
-        shutil.rmtree(root)
+        for folder in (root, tmp_path / "latents.parts"):
+            shutil.rmtree(folder)
 
 
 def test_a_push_of_other_samples_is_refused(
