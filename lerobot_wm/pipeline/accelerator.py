@@ -83,7 +83,7 @@ class RamAccelerator(Accelerator):
         super().backward(loss, **kwargs)
         if self.scaler is None:  # that of float16 skips such steps by itself
             last = Path(self._train_config.output_dir) / "checkpoints" / "last"
-            self._watch.check(loss, self._loaders[0], last)
+            self._watch.check(loss, self._loaders[0], last, self.num_processes)
 
     def prepare_data_loader(self, data_loader: Any, *args: Any, **kwargs: Any) -> RamLoader:
         """Replace the loader by one that reads the same samples, this process's share of them, from memory.

@@ -38,7 +38,7 @@ class LossWatch:
 
         return noted
 
-    def check(self, loss: Tensor, served: RamLoader, last_checkpoint: Path) -> None:
+    def check(self, loss: Tensor, served: RamLoader, last_checkpoint: Path, n_processes: int = 1) -> None:
         """Look at a step between its backward pass and the optimizer's.
 
         Processes that train together find a gradient that is not finite at the same step: they have averaged it.
@@ -47,6 +47,7 @@ class LossWatch:
             loss: The scalar.
             served: The batch is the last it served.
             last_checkpoint: Where to go on from, if it is there.
+            n_processes: How many train together.
 
         Raises:
             DivergenceError: The loss or a gradient is not finite.
@@ -56,14 +57,16 @@ class LossWatch:
         if bool((loss.detach() + norm).isfinite()):
             return
         parts = ", ".join(self._broken_parts()) or f"the gradient of {next(self._broken_gradients(), 'all')}"
-        episodes = ", ".join(map(str, served.episodes))
+        where = f"on a batch of the episodes {', '.join(map(str, served.episodes))}"
+        if n_processes > 1 and loss.isfinite():  # its own batch may be innocent
+            where = f"in one of {n_processes} processes, of which this one was {where}"
         saved = (
             f"the last checkpoint, {last_checkpoint}, is whole"
             if last_checkpoint.exists()
             else "none is saved yet"
         )
         raise DivergenceError(
-            f"training diverged: {parts} is NaN or Inf on a batch of the episodes {episodes}. It did "
+            f"training diverged: {parts} is NaN or Inf {where}. It did "
             f"not reach the weights; {saved}. Train again with a lower --policy.lr, or go on in --policy.dtype=float32."
         )
 

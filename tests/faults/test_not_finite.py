@@ -125,3 +125,10 @@ def test_a_gradient_that_is_not_finite_is_named(whole_dataset: Path, tmp_path: P
             DivergenceError, match=f"{broken} is NaN or Inf on a batch of the episodes 0, 1, 3. .*none is"
         ):
             watch.check(loss, served, tmp_path / "last")
+        own = (
+            "on a batch of"
+            if "part" in broken
+            else "in one of 2 processes, of which this one was on a batch of"
+        )
+        with pytest.raises(DivergenceError, match=f"{broken} is NaN or Inf {own} the episodes 0, 1, 3. "):
+            watch.check(loss, served, tmp_path / "last", 2)
