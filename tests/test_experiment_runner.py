@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -247,6 +248,32 @@ def test_stopping_a_run_ends_its_stages(tmp_path: Path, number: signal.Signals) 
     assert not any(map(alive, pids))
     with exclusive(tmp_path):
         pass
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stage_that_starts_while_the_run_is_stopped_ends_with_it(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The signal comes when its process is there and nobody knows of it yet."""
+    started = []
+
+    class Interrupted(subprocess.Popen):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            started.append(self.pid)
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(subprocess, "Popen", Interrupted)
+    before = [signal.signal(n, signal.default_int_handler) for n in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path, [stage(tmp_path, "long", code="import time; time.sleep(600)")])
+        assert signal.getsignal(number) is signal.default_int_handler
+    finally:
+        for n, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+            signal.signal(n, handler)
+    assert len(started) == 1
+    assert not alive(started[0])
 
 
 def test_stages_that_outlive_a_killed_run_keep_the_folder_locked(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import IO
 
-from lerobot_wm.experiment.process import Running, stop
+from lerobot_wm.experiment.process import Running, stop, stops_held_back
 from lerobot_wm.experiment.progress import Progress
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.experiment.times import Times, ranks
@@ -76,7 +76,8 @@ class Runner:
         side_by_side = min(self._processes, len(self._running) + len(ready))
         for stage in ready[: self._processes - len(self._running)]:
             self._progress.started(stage)
-            self._running.append(Running(stage, max(1, self._cores // side_by_side), lock))
+            with stops_held_back():
+                self._running.append(Running(stage, max(1, self._cores // side_by_side), lock))
             del self._waiting[stage.name]
 
     def _reap(self) -> None:
