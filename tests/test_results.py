@@ -120,7 +120,7 @@ def test_readme_shows_the_committed_measurements() -> None:
     without = {tuple(row[:3]): row[-1] for row in table("cpu2_float32.md")}
     measured = {(*row[2:], without.get(tuple(row[:3]))) for row in table("cpu2.md")}
     section = (ROOT / "README.md").read_text().split("\n## Speed\n")[1].split("\n## ")[0]
-    [evaluation] = [row for row in table("cpu2_float32.md") if row[2] == "lerobot-eval, metaworld"]
+    *_, evaluation = [row for row in table("cpu2_float32.md") if row[2] == "lerobot-eval, metaworld"]
     ours, theirs = (cell.split()[0] for cell in evaluation[3:5])
     assert f"made {ours} rollouts of 500 steps a minute" in section
     assert f"Meta-World environment {theirs}: {evaluation[5]} times as many" in section

@@ -5,8 +5,7 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import IO
 
 from lerobot_wm.experiment.stage import Stage
@@ -65,23 +64,6 @@ class Running:
             subprocess.TimeoutExpired: it runs on.
         """
         self._process.wait(seconds)
-
-
-@contextmanager
-def stops_held_back() -> Iterator[None]:
-    """Have Ctrl-C and SIGTERM wait: a process that is being started is known, and can be ended, only afterwards."""
-    arrived: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, frame: arrived.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if arrived:
-            signal.raise_signal(arrived[0])
 
 
 def stop(running: Sequence[Running]) -> None:

@@ -1,13 +1,15 @@
 """Running stages side by side: in the order of what waits for them, within the machine's cores."""
 
+import signal
 import time
 from collections.abc import Callable, Mapping
 from typing import IO
 
-from lerobot_wm.experiment.process import Running, stop, stops_held_back
+from lerobot_wm.experiment.process import Running, stop
 from lerobot_wm.experiment.progress import Progress
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.experiment.times import Times, ranks
+from lerobot_wm.pipeline.signals import held_back
 
 POLL_SECONDS = 0.2
 
@@ -76,7 +78,7 @@ class Runner:
         side_by_side = min(self._processes, len(self._running) + len(ready))
         for stage in ready[: self._processes - len(self._running)]:
             self._progress.started(stage)
-            with stops_held_back():
+            with held_back(signal.SIGINT, signal.SIGTERM):
                 self._running.append(Running(stage, max(1, self._cores // side_by_side), lock))
             del self._waiting[stage.name]
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 
 from lerobot_wm.pipeline.errors import explained_to_parent
+from lerobot_wm.pipeline.signals import held_back
 
 
 def map_in_workers[Item, Result](
@@ -67,11 +68,12 @@ def _exit_with_parent() -> None:
 @contextmanager
 def interrupts_held() -> Iterator[None]:
     """Let Ctrl-C wait; processes started meanwhile never see it, and leave it to this one."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with held_back(signal.SIGINT):
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which they inherit
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
