@@ -6,7 +6,7 @@ import os
 import statistics
 import subprocess
 from collections.abc import Collection, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -109,8 +109,9 @@ class SideProcess:
     def measure(self) -> float:
         """One value."""
         assert self._process.stdin is not None
-        self._process.stdin.write("measure\n")
-        self._process.stdin.flush()
+        with suppress(BrokenPipeError):  # it ended meanwhile, and gives no answer
+            self._process.stdin.write("measure\n")
+            self._process.stdin.flush()
         return self._answer()
 
     def _answer(self) -> Any:

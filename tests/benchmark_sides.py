@@ -1,5 +1,8 @@
 """Sides of rows for the tests of `benchmarks`: real processes that answer at once and note that they were asked."""
 
+import os
+import threading
+import time
 from pathlib import Path
 
 from benchmarks.timing import Prepared
@@ -33,3 +36,11 @@ def stranger(folder: Path, batch: int, seconds: float) -> Prepared:
 
 def broken(folder: Path, batch: int, seconds: float) -> Prepared:
     raise ValueError(f"no batch of {batch} for you")
+
+
+def slow(folder: Path, batch: int, seconds: float) -> Prepared:
+    return Prepared(lambda: time.sleep(1.0) or 1.0, {})
+
+
+def mortal(folder: Path, batch: int, seconds: float) -> Prepared:
+    return Prepared(lambda: threading.Timer(0.1, os._exit, [9]).start() or 1.0, {})

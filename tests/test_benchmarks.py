@@ -62,6 +62,11 @@ def test_failing_side_says_why(tmp_path: Path) -> None:
         measure_row(row("broken"), SIZES[0], tmp_path, threads=1, repeats=1)
 
 
+def test_a_side_that_dies_while_it_waits_says_so(tmp_path: Path) -> None:
+    with pytest.raises(SideError, match="ended without an answer"):
+        measure_row(row("mortal", ours="slow"), SIZES[0], tmp_path, threads=1, repeats=2)
+
+
 def test_losses_are_compared_part_by_part() -> None:
     check_losses({"a": {"loss": 100.0, "kl": 1.0, "dtype": "float32"}, "b": {"loss": 100.005, "kl": 1.0}})
     check_losses({"a": {}, "b": {"loss": 1.0}})

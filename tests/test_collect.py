@@ -171,17 +171,6 @@ def test_complete_dataset_is_left_alone(
         collect(other)
 
 
-def test_dataset_of_before_there_was_a_choice_is_complete(
-    dataset: LeRobotDataset, config: CollectConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    record = json.loads((config.output_root / COLLECTION_RECORD).read_text())
-    del record["config"]["variation_set"], record["config"]["camera_name"]
-    (tmp_path / "meta").mkdir()
-    (tmp_path / COLLECTION_RECORD).write_text(json.dumps(record))
-    collect(CollectConfig(**{**vars(config), "root": tmp_path}))
-    assert "already complete" in capsys.readouterr().out
-
-
 def test_collection_on_the_second_set(tmp_path: Path) -> None:
     one_shard(tmp_path, task="reach-v3", variation_set=43, variations=(7,))
     shard = LeRobotDataset("shards/reach-v3-00000", root=tmp_path / "reach-v3-00000")

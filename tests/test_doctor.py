@@ -1,5 +1,6 @@
 """`lerobot-wm doctor`: what it says of this machine, and of broken ones."""
 
+import io
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from rich.console import Console
 
 from lerobot_wm.pipeline import doctor
 
@@ -50,6 +52,21 @@ def test_leftovers_of_mujoco_4_are_reported() -> None:
 def test_missing_package_is_reported() -> None:
     check = doctor.check_requirement(Requirement("metaworld==3.0.0"), {})
     assert check.verdict == "mend: pip install 'metaworld==3.0.0'"
+
+
+def test_advice_keeps_the_extras_and_is_shown_whole() -> None:
+    check = doctor.check_requirement(Requirement("lerobot[training,dataset]>=0.6.1,<0.7"), {})
+    assert check.mend == "pip install 'lerobot[dataset,training]<0.7,>=0.6.1'"
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(doctor.render([check]))
+    assert "lerobot[dataset,training]" in console.export_text()
+
+
+def test_a_discovery_that_dies_without_a_word_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "DISCOVERY", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
+    check = doctor.check_discovery()
+    assert check.is_broken
+    assert check.found == "ended with signal or code -9"
 
 
 def test_full_disk_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

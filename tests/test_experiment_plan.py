@@ -167,6 +167,24 @@ def test_a_training_is_finished_by_its_last_step_only(tmp_path: Path) -> None:
     assert "--resume=true" in training.command(cores=1)
 
 
+def test_a_training_killed_between_two_links_keeps_its_checkpoints(tmp_path: Path) -> None:
+    training = stages_of(tmp_path, "wm_bc")["seed_0/wm_bc"]
+    assert training.checkpoint is not None
+    last = training.checkpoint.parents[1]
+    saved = last.with_name("000500")
+    for file, content in (
+        ("pretrained_model/train_config.json", {"scheduler": None}),
+        ("training_state/optimizer_param_groups.json", []),
+    ):
+        (saved / file).parent.mkdir(parents=True)
+        (saved / file).write_text(json.dumps(content))
+    assert not last.exists()
+    assert training.resumes
+    assert "--resume=true" in training.command(cores=1)
+    training.prepare()
+    assert saved.is_dir()
+
+
 def test_collections_and_encodings_go_on_from_what_they_left(tmp_path: Path) -> None:
     stages = stages_of(tmp_path, "wm_bc")
     collection, encoding = stages["dataset"], stages["seed_0/latents_wm_rssm"]

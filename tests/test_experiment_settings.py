@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_wm.experiment.arms import ARMS
 from lerobot_wm.experiment.preset import Preset, load_preset
 from lerobot_wm.experiment.settings import check_settings
 
@@ -44,3 +45,24 @@ def test_further_arms_seeds_and_settings_files_change_nothing(preset: Preset, tm
     change(preset, "new_arm.json", steps=1)
     with pytest.raises(ValueError, match=r"steps of .*new_arm"):
         check_settings(preset, tmp_path)
+
+
+def test_an_arm_that_is_defined_otherwise_is_refused(
+    preset: Preset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check_settings(preset, tmp_path)
+    changed = replace(ARMS["wm_bc"], train_flags=("--policy.dropout=0",))
+    monkeypatch.setitem(ARMS, "wm_bc", changed)
+    with pytest.raises(ValueError, match=r"wm_bc of .*arms\.py.* another --output_dir"):
+        check_settings(preset, tmp_path)
+    monkeypatch.undo()
+    monkeypatch.setitem(ARMS, "further", changed)
+    check_settings(preset, tmp_path)
+
+
+def test_a_folder_of_before_arms_were_noted_is_gone_on_with(preset: Preset, tmp_path: Path) -> None:
+    check_settings(preset, tmp_path)
+    path = tmp_path / "settings.json"
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "arms"}))
+    check_settings(preset, tmp_path)
+    assert "wm_bc" in json.loads(path.read_text())["arms"]

@@ -8,6 +8,7 @@ import pytest
 from metaworld.policies import SawyerDoorOpenV3Policy
 
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
+from lerobot_wm.pipeline.expert import ExpertConfig, roll_out_expert
 from lerobot_wm.report.records import Record, read_records
 
 
@@ -95,3 +96,14 @@ def test_earlier_records_are_never_overwritten(
     (tmp_path / "records.jsonl").write_text("")
     with pytest.raises(FileExistsError, match="remove it"):
         lerobot_wm_command(f"expert --output_dir={tmp_path}")
+
+
+def test_records_that_another_has_finished_meanwhile_stay(tmp_path: Path) -> None:
+    class Late(ExpertConfig):
+        def validate(self) -> None:
+            super().validate()
+            self.records_file.write_text("finished")
+
+    with pytest.raises(FileExistsError, match="remove it"):
+        roll_out_expert(Late(tasks="reach-v3", variations="0", output_dir=tmp_path))
+    assert (tmp_path / "records.jsonl").read_text() == "finished"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -51,6 +52,14 @@ def test_statistics_are_those_of_the_new_reward(dense: LeRobotDataset, demos: Le
     for _, episode in pd.read_parquet(file).iterrows():
         rows = slice(episode["dataset_from_index"], episode["dataset_to_index"])
         assert episode["stats/next.reward/max"] == pytest.approx(rewards[rows].max())
+
+
+def test_tables_keep_a_row_group_for_each_episode(dense: LeRobotDataset) -> None:
+    """By which LeRobot finds an episode in a large file."""
+    groups = [
+        pq.read_metadata(file).num_row_groups for file in (Path(dense.root) / "data").rglob("*.parquet")
+    ]
+    assert sum(groups) == dense.meta.total_episodes > 1
 
 
 def test_it_says_where_the_reward_comes_from(dense: LeRobotDataset, demos_root: Path) -> None:

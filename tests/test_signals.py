@@ -10,6 +10,13 @@ import pytest
 from lerobot_wm.pipeline.workers import interrupts_held
 
 
+def interrupted(finished: list[bool]) -> None:
+    with interrupts_held():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.2)
+        finished.append(True)
+
+
 def test_ctrl_c_waits_whichever_thread_it_reaches() -> None:
     """A thread from before, such as a progress bar's, does not block it."""
     over = threading.Event()
@@ -18,10 +25,8 @@ def test_ctrl_c_waits_whichever_thread_it_reaches() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     finished = []
     try:
-        with pytest.raises(KeyboardInterrupt), interrupts_held():
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.2)
-            finished.append(True)
+        with pytest.raises(KeyboardInterrupt):
+            interrupted(finished)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()), "nothing stays blocked"
     finally:

@@ -12,6 +12,7 @@ from wandb.proto.wandb_internal_pb2 import Record
 from wandb.sdk.internal.datastore import DataStore
 
 from lerobot_wm.pipeline.wandb_log import wandb_run
+from lerobot_wm.policies.checkpoint import split_revision
 from tests.flags import DATASET_FLAGS, SMALL_WORLD_MODEL, TRAIN_FLAGS
 
 
@@ -128,3 +129,19 @@ def test_what_wandb_refuses_is_told_in_our_words(
         wandb_run(cfg, None, tmp_path),
     ):
         pass
+
+
+def test_the_run_is_that_of_the_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each revision of a checkpoint on the Hub was trained in a run of its own."""
+    repository = tmp_path / "hub" / "models--user--wm"
+    for branch, commit in (("main", "a" * 40), ("v1", "b" * 40)):
+        (repository / "refs").mkdir(parents=True, exist_ok=True)
+        (repository / "refs" / branch).write_text(commit)
+        settings = repository / "snapshots" / commit / "train_config.json"
+        settings.parent.mkdir(parents=True)
+        settings.write_text(json.dumps({"wandb": {"run_id": f"of-{branch}", "mode": "offline"}}))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    for checkpoint, run_id in (("user/wm@v1", "of-v1"), ("user/wm", "of-main")):
+        name, revision = split_revision(checkpoint)
+        with wandb_run(WandBConfig(enable=True), Path(name), tmp_path / run_id, revision) as run:
+            assert run.id == run_id

@@ -30,9 +30,6 @@ def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> 
         OSError: The folder cannot be written.
     """
     output.parent.mkdir(parents=True, exist_ok=True)
-    names = [f".{output.name}.lock"]
-    if job is not None:
-        names.append(f".{output.name}.{job}.lock")
     # Jobs share the lock of the whole, for which filelock has no kind; each holds its own alone.
     locks = {f".{output.name}.lock": fcntl.LOCK_EX if job is None else fcntl.LOCK_SH}
     if job is not None:

@@ -21,6 +21,7 @@ from lerobot_wm.experiment.demonstrations import Demonstrations
 from lerobot_wm.experiment.preset import Preset
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.pipeline.share import parts_folder
+from lerobot_wm.pipeline.train_resume import goes_on
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,7 @@ class Plan:
             artefact=final / TRAINING_STATE_DIR / OPTIMIZER_PARAM_GROUPS,
             needs=(dataset.made_by,),
             checkpoint=last,
+            is_there=goes_on,
             resume_argv=lerobot_wm("train", {"config_path": last, "resume": "true", **places}),
         )
         return Checkpoint(stage, final / PRETRAINED_MODEL_DIR)

@@ -1,12 +1,16 @@
 """The settings an output folder was made with, so that changed ones are not mixed into it."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from lerobot_wm.experiment.arms import ARMS
 from lerobot_wm.experiment.preset import PRESET_FILE, Preset
 
 SETTINGS_NAME = "settings.json"
+
+_ARMS = "arms"  # in that file, beside the names of the preset's
 
 _CHANGE_NOTHING_MADE = ("arms", "minutes", "videos_per_task")  # of experiment.json
 
@@ -32,10 +36,25 @@ def check_settings(preset: Preset, output_dir: Path) -> None:
         before = known.get(file, settings)
         changed = [key for key in {**before, **settings} if before.get(key) != settings.get(key)]
         if changed:
-            raise ValueError(
-                f"{output_dir} was made with other settings: {', '.join(changed)} of {preset.folder / file}. Set them "
-                f"back or give another --output_dir; or remove there what depends on them, the own_records*.jsonl "
-                f"among it, and {path}."
-            )
+            raise ValueError(_refusal(output_dir, changed, preset.folder / file))
+    arms = json.loads(
+        json.dumps({name: asdict(arm) for name, arm in ARMS.items()})
+    )  # as the earlier ones are read
+    before = known.get(_ARMS, {})
+    changed = [
+        name for name in arms if before.get(name, arms[name]) != arms[name]
+    ]  # a new one changes nothing
+    if changed:
+        raise ValueError(_refusal(output_dir, changed, Path("lerobot_wm/experiment/arms.py")))
     output_dir.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(known | now, indent=1) + "\n")
+    unfinished = path.with_name(f"{path.name}.part")
+    unfinished.write_text(json.dumps(known | now | {_ARMS: arms}, indent=1) + "\n")
+    unfinished.replace(path)
+
+
+def _refusal(output_dir: Path, changed: list[str], file: Path) -> str:
+    return (
+        f"{output_dir} was made with other settings: {', '.join(changed)} of {file}. Set them back or give another "
+        "--output_dir; or remove there what depends on them, the own_records*.jsonl among it, and "
+        f"{output_dir / SETTINGS_NAME}."
+    )

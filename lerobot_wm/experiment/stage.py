@@ -18,6 +18,7 @@ class Stage:
         artefact: The file it writes last: there is one exactly when the stage is finished.
         needs: Stages that must be finished before.
         checkpoint: The file or folder a stopped stage goes on from; None when it has to start from nothing.
+        is_there: Whether the checkpoint is; where a kill can leave it hidden, it is brought back first.
         resume_argv: The command to go on with; none where `argv` itself goes on.
         takes_workers: Whether it spreads over the cores it is given by `--num_workers`.
     """
@@ -29,6 +30,7 @@ class Stage:
     artefact: Path
     needs: tuple["Stage", ...] = ()
     checkpoint: Path | None = None
+    is_there: Callable[[Path], bool] = Path.exists
     resume_argv: tuple[str, ...] = ()
     takes_workers: bool = False
 
@@ -45,7 +47,7 @@ class Stage:
     @property
     def resumes(self) -> bool:
         """Whether a stopped run of it left something to go on from."""
-        return self.checkpoint is not None and self.checkpoint.exists()
+        return self.checkpoint is not None and self.is_there(self.checkpoint)
 
     def command(self, cores: int) -> list[str]:
         """The command to run now, with the cores it may use."""

@@ -1,5 +1,6 @@
 """The model card of our policy types: what it is, how it was trained, how well it does, how to use it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -11,7 +12,7 @@ from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.constants import ACTION, OBS_LATENT, OBS_STATE, TASK
+from lerobot_wm.constants import ACTION, OBS_LATENT, TASK
 from lerobot_wm.data.fingerprint import dataset_fingerprint
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.hub.eval_command import eval_command
@@ -65,6 +66,7 @@ def model_card(
     results: str | None = None,
     imagined_tasks: list[str] | None = None,
     *,
+    features_read: Sequence[str],
     makes_latents: bool,
 ) -> ModelCard:
     """Write the card.
@@ -78,6 +80,7 @@ def model_card(
         results: Tables of an evaluation, in Markdown.
         imagined_tasks: What the columns of `IMAGINATION` show, which is published with the card; None where there is
             no such file.
+        features_read: Keys of the inputs it reads; a world model's configuration keeps all that its dataset has.
         makes_latents: Whether it is a world model, or what stands in its place, and not a policy that acts.
     """
     settings = draccus.encode(config)
@@ -100,7 +103,7 @@ def model_card(
         example=Markdown(_example(config, settings)),
         evaluation=None if makes_latents else Markdown(eval_command(config, repo_id)),
         action_shape=(1, *config.output_features[ACTION].shape),
-        inputs=_inputs(config, settings),
+        inputs={key: tuple(config.input_features[key].shape) for key in features_read},
         run=cfg,
         command=Markdown(train_command(cfg, data.latents if data else None)) if cfg else None,
         data=data,
@@ -110,15 +113,6 @@ def model_card(
         imagined_tasks=imagined_tasks,
     )
     return ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n{body}")
-
-
-def _inputs(config: PreTrainedConfig, settings: dict) -> dict[str, tuple[int, ...]]:
-    """Shapes of what the policy reads; a world model's configuration keeps all that its dataset has."""
-    features = config.input_features
-    if config.type == "wm_rssm":
-        state = [OBS_STATE] if settings["rssm"]["use_proprio"] else []
-        features = {key: features[key] for key in [*settings["image_key"].split(","), *state]}
-    return {key: tuple(feature.shape) for key, feature in features.items()}
 
 
 def _example(config: PreTrainedConfig, settings: dict) -> str:

@@ -10,7 +10,6 @@ from pathlib import Path
 import draccus
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.constants import CAMERA_NAME, REPORTED_VARIATION_SET
 from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.hub.dataset_card import push_demonstrations
@@ -96,9 +95,7 @@ def _is_complete(config: CollectConfig, root: Path) -> bool:
         raise FileExistsError(
             f"{root} exists and was not made by `lerobot-wm collect`; give another --root or remove it."
         )
-    # Datasets made before there was a choice of these do not name theirs.
-    earlier = {"variation_set": REPORTED_VARIATION_SET, "camera_name": CAMERA_NAME}
-    found = {**earlier, **json.loads(record.read_text())["config"]}
+    found = json.loads(record.read_text())["config"]
     refuse_difference(found, config.identity(), f"{root} holds a dataset", "give another --root or remove it")
     return True
 

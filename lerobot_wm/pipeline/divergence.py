@@ -21,9 +21,11 @@ class LossWatch:
     def __init__(self) -> None:
         self._parts: dict[str, Any] = {}
         self._trained: list[tuple[str, nn.Parameter]] = []
+        self._config: object = None
 
     def attach(self, model: nn.Module) -> None:
         """Follow a LeRobot policy, prepared for training; its `forward` returns the loss and its parts by name."""
+        self._config = getattr(model, "config", None)
         self._trained = [
             (name, parameter) for name, parameter in model.named_parameters() if parameter.requires_grad
         ]
@@ -66,9 +68,16 @@ class LossWatch:
             else "none is saved yet"
         )
         raise DivergenceError(
-            f"training diverged: {parts} is NaN or Inf {where}. It did "
-            f"not reach the weights; {saved}. Train again with a lower --policy.lr, or go on in --policy.dtype=float32."
+            f"training diverged: {parts} is NaN or Inf {where}. It did not reach the weights; {saved}. "
+            f"{self._mend(last_checkpoint.exists())}"
         )
+
+    def _mend(self, can_go_on: bool) -> str:
+        rates = [f"--policy.{name}" for name in ("lr", "optimizer_lr") if hasattr(self._config, name)]
+        mend = f"Train again with a lower {(rates or ['learning rate'])[0]}"
+        if getattr(self._config, "dtype", None) != "bfloat16":
+            return f"{mend}."
+        return f"{mend}, or {'go on' if can_go_on else 'train'} in --policy.dtype=float32."
 
     def _broken_parts(self) -> Iterator[str]:
         for name, value in self._parts.items():

@@ -14,6 +14,7 @@ import torch
 from huggingface_hub import constants, get_token
 from packaging.requirements import Requirement
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from tqdm import tqdm
 
@@ -25,7 +26,7 @@ MAIN_PACKAGES = ("lerobot", "torch", "metaworld", "mujoco")
 # Parts of mujoco 4.x that install into the same mujoco/ folder and stay behind after a downgrade.
 MUJOCO_LEFTOVERS = ("mujoco-core", "mujoco-studio")
 GL_PACKAGES = "libegl1 libopengl0 libgl1-mesa-dri"
-POLICY_TYPES = ("wm_rssm", "wm_bc", "wm_iql")
+POLICY_TYPES = ("wm_rssm", "frozen_backbone", "wm_bc", "wm_iql", "e2e_bc", "e2e_iql")
 MIN_FREE_GB = 5.0  # outputs of a full-size run: dataset, frame cache, latents, checkpoints and videos
 WIDTH = 100
 
@@ -85,7 +86,7 @@ def check_requirement(requirement: Requirement, installed: dict[str, str]) -> Ch
         requirement: a line of pyproject.toml's dependencies.
         installed: version per distribution name (lower case, dashes).
     """
-    wanted = f"{requirement.name}{requirement.specifier}"
+    wanted = f"{requirement}".split(";")[0].strip()  # with its extras
     version = installed.get(requirement.name)
     if version is None:
         return Check(requirement.name, "not installed", f"pip install '{wanted}'")
@@ -122,6 +123,12 @@ def installed_versions() -> dict[str, str]:
     return versions
 
 
+def last_words(run: subprocess.CompletedProcess[str]) -> str:
+    """Why a process failed: the last line of its errors, or how it ended where it left none."""
+    lines = run.stderr.strip().splitlines()
+    return lines[-1] if lines else f"ended with signal or code {run.returncode}"
+
+
 def check_rendering() -> Check:
     """Render a real frame in another process, so that a crash of the GL driver is seen, not suffered."""
     backend = os.environ.get("MUJOCO_GL", "egl" if sys.platform == "linux" else "")
@@ -136,9 +143,8 @@ def check_rendering() -> Check:
     name = backend or "default"
     if run.returncode == 0:
         return Check("rendering", f"MUJOCO_GL={name} draws a frame")
-    said = run.stderr.strip().splitlines()[-1:] or [f"ended with signal or code {run.returncode}"]
     mend = f"MUJOCO_GL=egl and, on Debian: apt-get install -y --no-install-recommends {GL_PACKAGES}"
-    return Check("rendering", f"MUJOCO_GL={name} fails: {said[0]}", mend)
+    return Check("rendering", f"MUJOCO_GL={name} fails: {last_words(run)}", mend)
 
 
 def check_discovery() -> Check:
@@ -147,7 +153,7 @@ def check_discovery() -> Check:
     if run.returncode != 0:
         return Check(
             "LeRobot plug-in",
-            run.stderr.strip().splitlines()[-1],
+            last_words(run),
             "reinstall: pip install -e . (or the wheel)",
         )
     expected = (*POLICY_TYPES, ENV_TYPE)
@@ -214,7 +220,7 @@ def render(checks: list[Check]) -> Table:
     table = Table("part", "found", "verdict", title="lerobot-wm doctor")
     for check in checks:
         style = "red" if check.is_broken else "yellow" if check.mend else "green"
-        table.add_row(check.name, check.found, f"[{style}]{check.verdict}[/]")
+        table.add_row(check.name, escape(check.found), f"[{style}]{escape(check.verdict)}[/]")
     return table
 
 

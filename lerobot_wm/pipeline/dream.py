@@ -11,6 +11,7 @@ from lerobot_wm.data.check import check_dataset
 from lerobot_wm.pipeline.quiet import quiet, silence
 from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.pipeline.wandb_log import log_dream, wandb_run
+from lerobot_wm.policies.checkpoint import split_revision
 from lerobot_wm.report.dream import Dreams, dream
 from lerobot_wm.report.dream_clips import write_dream
 from lerobot_wm.report.dream_figures import strip_figure
@@ -31,7 +32,7 @@ class DreamConfig:
     """Flags of `lerobot-wm dream`.
 
     Args:
-        policy: Folder or Hub id of a wm_rssm, wm_bc or wm_iql checkpoint.
+        policy: Folder or Hub id, with @revision or not, of a wm_rssm, wm_bc or wm_iql checkpoint.
         dataset: The image dataset.
         episode: Which of its episodes.
         context: Frames at its beginning that the world model sees.
@@ -70,7 +71,8 @@ def dream_of(cfg: DreamConfig) -> Dreams:
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     write_dream(video, dreams, meta.fps)
     strip.write_bytes(figure_bytes(strip_figure(dreams), PNG))
-    with wandb_run(cfg.wandb, Path(cfg.policy.path), cfg.output_dir) as run:
+    name, checkpoint_revision = split_revision(cfg.policy.path)
+    with wandb_run(cfg.wandb, Path(name), cfg.output_dir, checkpoint_revision) as run:
         if run is not None:
             log_dream(run, dreams, video, strip)
     return dreams

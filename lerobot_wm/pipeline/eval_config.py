@@ -49,7 +49,6 @@ class EvaluateConfig(EvalPipelineConfig):
         Raises:
             ValueError: no policy, no seed, a rollout that would run twice, a flag that belongs elsewhere, or an
                 environment that the policy was not trained for.
-            FileExistsError: the records file is there already.
         """
         if self.policy is None:
             raise ValueError("No policy: give --policy.path=CHECKPOINT_FOLDER_OR_HUB_ID.")
@@ -64,11 +63,6 @@ class EvaluateConfig(EvalPipelineConfig):
         if isinstance(self.policy, LatentPolicyConfig) and self.policy.save_predicted_video:
             raise ValueError(
                 "--policy.save_predicted_video=true films predictions: use `lerobot-eval` for that."
-            )
-        if self.records_file.exists():
-            raise FileExistsError(
-                f"{self.records_file} holds the records of an earlier evaluation: remove it, or give another "
-                "--output_dir or --records."
             )
         n_variations = len({variation_of(self.env, seed) for seed in self.seeds})
         if n_variations < self.eval.n_episodes:

@@ -20,9 +20,9 @@ from rich.console import Console
 from tqdm import tqdm
 
 from lerobot_wm.cores import usable_cores
-from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.pipeline.eval_config import EvaluateConfig
 from lerobot_wm.pipeline.processors import check_policy_path, check_processors
+from lerobot_wm.pipeline.records_file import new_records
 from lerobot_wm.pipeline.remarks import drop_remarks
 from lerobot_wm.pipeline.rollouts import TaskRunner, task_names
 from lerobot_wm.pipeline.wandb_log import log_evaluation, wandb_run
@@ -65,12 +65,12 @@ def evaluate(cfg: EvaluateConfig) -> list[Record]:
     The records file appears when the last rollout is done; until then its lines are in `<name>.part`.
 
     Raises:
-        ValueError, FileExistsError: see `EvaluateConfig.validate`.
-        BlockingIOError: another process writes these records.
+        ValueError: see `EvaluateConfig.validate`.
+        FileExistsError, BlockingIOError: see `new_records`.
         ValueError, FileNotFoundError: the checkpoint is not whole, or its processors name code of their own.
     """
     cfg.validate()
-    with sole_writer(cfg.records_file):
+    with new_records(cfg.records_file):
         return _evaluate(cfg)
 
 
@@ -79,7 +79,8 @@ def _evaluate(cfg: EvaluateConfig) -> list[Record]:
     if isinstance(cfg.policy, MultiTaskConfig):  # small: a broken one is found before environments are built
         make_policy(deepcopy(cfg.policy), env_cfg=cfg.env, rename_map=cfg.rename_map)
     tasks = task_names(cfg)
-    with wandb_run(cfg.wandb, cfg.policy.pretrained_path, cfg.output_dir) as run:
+    revision = cfg.policy.pretrained_revision
+    with wandb_run(cfg.wandb, cfg.policy.pretrained_path, cfg.output_dir, revision) as run:
         records = _write_records(cfg, tasks)
         if run is not None:
             log_evaluation(run, cfg.arm_name, records)

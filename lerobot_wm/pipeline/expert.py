@@ -11,12 +11,12 @@ from rich.console import Console
 from tqdm import tqdm
 
 from lerobot_wm.constants import MAX_EPISODE_STEPS, NUM_VARIATIONS, REPORTED_VARIATION_SET
-from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import check_variation_set, is_seen, parse_variations
 from lerobot_wm.pipeline.collect_episode import demonstrate
 from lerobot_wm.pipeline.quiet import quiet, silence
+from lerobot_wm.pipeline.records_file import new_records
 from lerobot_wm.pipeline.workers import map_in_workers
 from lerobot_wm.report.records import Record, record_line
 from lerobot_wm.report.tables import table_by_split, terminal_tables
@@ -57,10 +57,6 @@ class ExpertConfig:
             raise ValueError(f"episode_length is {self.episode_length}; expected 1 to {MAX_EPISODE_STEPS}.")
         if self.num_workers < 1:
             raise ValueError(f"--num_workers={self.num_workers}: expected at least 1.")
-        if self.records_file.exists():
-            raise FileExistsError(
-                f"{self.records_file} holds earlier records: remove it, or give another --output_dir."
-            )
 
     @property
     def records_file(self) -> Path:
@@ -72,11 +68,11 @@ def roll_out_expert(cfg: ExpertConfig) -> list[Record]:
     """Roll the experts out and write their records, as `lerobot-wm eval` writes a policy's.
 
     Raises:
-        ValueError, FileExistsError: see `ExpertConfig.validate`.
-        BlockingIOError: another process writes these records.
+        ValueError: see `ExpertConfig.validate`.
+        FileExistsError, BlockingIOError: see `new_records`.
     """
     cfg.validate()
-    with sole_writer(cfg.records_file):
+    with new_records(cfg.records_file):
         return _write_records(cfg, resolve_tasks(cfg.tasks))
 
 

@@ -3,7 +3,6 @@
 `--policy.push_to_hub` publishes what training ends with, when there is no evaluation yet. This adds one afterwards.
 """
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -104,6 +103,7 @@ def publish(cfg: PublishConfig) -> str:
         _training_data(run),
         results,
         tasks,
+        features_read=config.features_read,
         makes_latents=isinstance(config, WorldModelConfig),
     )
     files["README.md"] = str(card).encode()
@@ -157,8 +157,5 @@ def _upload(files: dict[str, Path | bytes], repo_id: str, private: bool) -> str:
 def main() -> None:
     """Entry point of `lerobot-wm publish`."""
     cfg = draccus.parse(PublishConfig)
-    try:
-        check_can_push(cfg.repo_id)
-        print(f"Published: {publish(cfg)}")
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"lerobot-wm publish: {error}")
+    check_can_push(cfg.repo_id)
+    print(f"Published: {publish(cfg)}")

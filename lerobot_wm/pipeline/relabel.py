@@ -11,7 +11,7 @@ from pathlib import Path
 import draccus
 import pyarrow as pa
 import pyarrow.parquet as pq
-from lerobot.datasets.io_utils import write_stats
+from lerobot.datasets.io_utils import write_stats, write_table_one_row_group_per_episode
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
@@ -73,14 +73,12 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, copy)
     for file in (partial / "data").rglob("*.parquet"):
-        _overwrite(file, {REWARD: reward})
+        write_table_one_row_group_per_episode(_with_columns(file, {REWARD: reward}), file)
     for file in (partial / "meta" / "episodes").rglob("*.parquet"):
         names = pq.read_schema(file).names
         of_reward = f"stats/{REWARD}/"
-        _overwrite(
-            file,
-            {name: name.replace(REWARD, reward) for name in names if name.startswith(of_reward)},
-        )
+        sources = {name: name.replace(REWARD, reward) for name in names if name.startswith(of_reward)}
+        pq.write_table(_with_columns(file, sources), file)
     write_stats({**source.meta.stats, REWARD: source.meta.stats[reward]}, partial)
     record = {
         "reward": reward,
@@ -92,12 +90,12 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
     return LeRobotDataset(output_repo_id, root=output_root)
 
 
-def _overwrite(file: Path, sources: dict[str, str]) -> None:
-    """Give columns of a parquet file the values of others: {column: the one it is taken from}."""
+def _with_columns(file: Path, sources: dict[str, str]) -> pa.Table:
+    """A parquet file's table whose columns have the values of others: {column: the one it is taken from}."""
     table: pa.Table = pq.read_table(file)
     for name, source in sources.items():
         table = table.set_column(table.schema.get_field_index(name), name, table[source])
-    pq.write_table(table, file)
+    return table
 
 
 def main() -> None:

@@ -19,7 +19,9 @@ def held_back(*numbers: signal.Signals) -> Iterator[None]:
         yield  # handlers run in the main thread only
         return
     arrived: list[int] = []
-    before = {number: signal.signal(number, lambda number, frame: arrived.append(number)) for number in numbers}
+    before = {
+        number: signal.signal(number, lambda number, frame: arrived.append(number)) for number in numbers
+    }
     try:
         yield
     finally:

@@ -37,13 +37,21 @@ def restore_last(config_path: str) -> None:
     Raises:
         FileNotFoundError: There is no such link, and no checkpoint that it could name.
     """
-    path = Path(config_path)
-    for link in (path, *path.parents):
-        if (link.parent.name, link.name) == (CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK) and not _is_set(link):
-            raise FileNotFoundError(
-                f"{link} is missing, and there is no whole checkpoint beside it: a training that was killed before its "
-                f"first begins again, without --resume; remove {link.parent.parent} before that."
-            )
+    link = _link_of(Path(config_path))
+    if link is not None and not _is_set(link):
+        raise FileNotFoundError(
+            f"{link} is missing, and there is no whole checkpoint beside it: a training that was killed before its "
+            f"first begins again, without --resume; remove {link.parent.parent} before that."
+        )
+
+
+def goes_on(config_path: Path) -> bool:
+    """Whether a training goes on from `.../checkpoints/last/pretrained_model/train_config.json`.
+
+    The link is set again where a kill fell between its removal and its setting.
+    """
+    link = _link_of(config_path)
+    return (link is None or _is_set(link)) and config_path.exists()
 
 
 def clear_unfinished(checkpoint: Path, output_dir: Path) -> None:
@@ -121,6 +129,14 @@ def is_whole(checkpoint: Path) -> bool:
 def _numbered(checkpoints: Path) -> list[Path]:
     """Folders of checkpoints, earliest first."""
     return sorted((path for path in checkpoints.glob("*") if path.name.isdigit()), key=lambda p: int(p.name))
+
+
+def _link_of(path: Path) -> Path | None:
+    """The `checkpoints/last` that a path leads through."""
+    places = (path, *path.parents)
+    return next(
+        (p for p in places if (p.parent.name, p.name) == (CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK)), None
+    )
 
 
 def _is_set(last: Path) -> bool:

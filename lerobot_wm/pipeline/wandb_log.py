@@ -19,13 +19,16 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def wandb_run(cfg: WandBConfig, policy_path: Path | None, folder: Path) -> Iterator["wandb.Run | None"]:
+def wandb_run(
+    cfg: WandBConfig, policy_path: Path | None, folder: Path, revision: str | None = None
+) -> Iterator["wandb.Run | None"]:
     """The run to log to: the one that trained the checkpoint, else, where that logged nothing, a new one.
 
     Args:
         cfg: LeRobot's `--wandb.*` flags. With a `run_id` that run is taken. Without `mode` it is that of the training.
         policy_path: The checkpoint: folder or Hub id.
         folder: Where wandb keeps its files.
+        revision: The checkpoint's branch, tag or commit on the Hub.
 
     Yields:
         The run; None without `--wandb.enable=true`.
@@ -40,7 +43,7 @@ def wandb_run(cfg: WandBConfig, policy_path: Path | None, folder: Path) -> Itera
     require_package("wandb", extra="training")
     import wandb
 
-    trained = WandBConfig(**training_config(policy_path).get("wandb", {}))
+    trained = WandBConfig(**training_config(policy_path, revision).get("wandb", {}))
     chosen = trained if trained.run_id is not None and cfg.run_id is None else cfg
     folder.mkdir(parents=True, exist_ok=True)
     try:

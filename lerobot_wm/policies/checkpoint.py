@@ -14,6 +14,14 @@ from safetensors import SafetensorError, safe_open
 WHOLE = "copy the checkpoint folder again, whole"  # what mends most of it
 
 
+def split_revision(checkpoint: str) -> tuple[str, str | None]:
+    """Folder or Hub id, and the revision of `user/name@revision`; a folder has none."""
+    if "@" not in checkpoint or Path(checkpoint).is_dir():
+        return checkpoint, None
+    name, _, revision = checkpoint.rpartition("@")
+    return name, revision
+
+
 def checkpoint_file(
     checkpoint: str | Path, name: str, revision: str | None = None, **hub: Any
 ) -> Path | None:

@@ -35,15 +35,15 @@ def training_dtype(dtype: str | None, device: str) -> str:
     return dtype or default_dtype(device)
 
 
-def feature_dim(features: dict[str, PolicyFeature], key: str, where: str) -> int:
-    """Size of the vector feature `key`.
+def feature_dim(features: dict[str, PolicyFeature], key: str) -> int:
+    """Size of the vector feature `key` of a dataset.
 
     Raises:
         ValueError: The feature is missing; names what is there. Or it is one number: LeRobot stores it without its
             axis, and the batch it makes of B of them, (1, B), cannot be told from one vector of B numbers.
     """
     if key not in features:
-        raise ValueError(f"{where} has no '{key}'; it has {sorted(features)}.")
+        raise ValueError(f"The dataset has no '{key}'; it has {sorted(features)}.")
     size = features[key].shape[0]
     if size == 1:
         raise ValueError(

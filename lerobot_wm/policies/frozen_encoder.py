@@ -1,12 +1,11 @@
 """What a latent policy holds and a dataset is encoded with: a world model, or an image backbone in its place."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_wm.data.fingerprint import weights_fingerprint
-from lerobot_wm.policies.checkpoint import read_config
+from lerobot_wm.policies.checkpoint import read_config, split_revision
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.world_model_config import WorldModelConfig
 from lerobot_wm.world_model.interface import LatentModel
@@ -29,9 +28,7 @@ def load_encoder(path: str) -> EncoderPolicy:
     Raises:
         ValueError, FileNotFoundError: The checkpoint has no encoder, or is damaged.
     """
-    name, revision = path, None
-    if "@" in path and not Path(path).is_dir():
-        name, revision = path.rsplit("@", 1)
+    name, revision = split_revision(path)
     config = read_config(name, revision)
     holds_one = isinstance(config, LatentPolicyConfig) and config.use_latent
     if not holds_one and not isinstance(config, WorldModelConfig):

@@ -74,11 +74,7 @@ class LatentPolicyConfig(CompileConfig, ImagePolicyConfig, MultiTaskConfig):
     @property
     def env_state_dim(self) -> int:
         """Size of the simulator's full state; 0 where the policy does not read it."""
-        return (
-            feature_dim(self.input_features, OBS_ENV_STATE, "The dataset")
-            if self.use_environment_state
-            else 0
-        )
+        return feature_dim(self.input_features, OBS_ENV_STATE) if self.use_environment_state else 0
 
     @property
     def latent_dim(self) -> int:

@@ -10,7 +10,7 @@ from torchvision.utils import make_grid
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.nn.normalize import Affine
-from lerobot_wm.policies.cameras import camera_images, check_observation, check_state, side_by_side
+from lerobot_wm.policies.cameras import camera_images, check_observation, side_by_side
 from lerobot_wm.policies.features import stat
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.latent_setup import check_latents, deployed_features, take_world_model
@@ -147,7 +147,7 @@ class LatentPolicy(MultiTaskPolicy):
         """
         if self.training:  # no dropout, as LeRobot's policies act
             self.eval()
-        check_state(self.config, batch)
+        check_observation(self.config, batch)
         state = batch[OBS_STATE]
         latent = self._filter(batch) if self.config.use_latent else None
         env_state = self._env_state(batch) if self.config.use_environment_state else None
@@ -161,7 +161,6 @@ class LatentPolicy(MultiTaskPolicy):
 
     def _filter(self, batch: dict[str, Any]) -> Tensor:
         """Advance the filter by one frame and return s_t, (B, L)."""
-        check_observation(self.config, batch)
         images = camera_images(self.config, batch)  # (B, C, H, W)
         # LeRobot gives no batch size at reset: the state is made when the first frame shows it.
         if self._prev_action is None or self._prev_action.shape[0] != images.shape[0]:

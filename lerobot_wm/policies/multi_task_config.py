@@ -43,12 +43,12 @@ class MultiTaskConfig(SingleFramesConfig):
     @property
     def state_dim(self) -> int:
         """Size of the proprioceptive state."""
-        return feature_dim(self.input_features, OBS_STATE, "The dataset")
+        return feature_dim(self.input_features, OBS_STATE)
 
     @property
     def action_dim(self) -> int:
         """Size of the action."""
-        return feature_dim(self.output_features, ACTION, "The dataset")
+        return feature_dim(self.output_features, ACTION)
 
     def check_tasks(self, names: Iterable[str]) -> None:
         """Refuse tasks that the policy was not trained on.

@@ -107,4 +107,12 @@ class StrictPolicy(PreTrainedPolicy):
         data = None if dataset_meta is None else TrainingData.of(dataset_meta)
         repo_id = self.config.repo_id or model_type
         makes_latents = isinstance(self.config, WorldModelConfig)
-        return model_card(type(self), self.config, repo_id, cfg, data, makes_latents=makes_latents)
+        return model_card(
+            type(self),
+            self.config,
+            repo_id,
+            cfg,
+            data,
+            features_read=self.config.features_read,
+            makes_latents=makes_latents,
+        )

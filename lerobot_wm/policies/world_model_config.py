@@ -38,7 +38,7 @@ class WorldModelConfig(ImagePolicyConfig, SingleFramesConfig):
     @property
     def action_dim(self) -> int | None:
         """Size of the actions that the model reads; None where it reads none."""
-        return feature_dim(self.output_features, ACTION, "The dataset")
+        return feature_dim(self.output_features, ACTION)
 
     def validate_features(self) -> None:
         """Choose the cameras.

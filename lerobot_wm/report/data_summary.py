@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.data.cache import frame_shape
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.policies.rewards import reward_columns
 from lerobot_wm.report.episodes import episodes_by_task
@@ -88,8 +89,7 @@ def _facts(meta: LeRobotDatasetMetadata) -> dict[str, str]:
         "frames": f"{meta.total_frames:,}, {minutes:.1f} minutes at {meta.fps} frames per second",
     }
     for key in meta.camera_keys:
-        shape = meta.features[key]["shape"]
-        height, width = shape[:2] if shape[2] <= 4 else shape[1:]  # channels are stored last or first
+        height, width, _ = frame_shape(meta.features[key])
         facts[f"camera {key}"] = f"{height} × {width} pixels"
     for name, key in (("proprioception", OBS_STATE), ("action", ACTION)):
         if key in meta.features:

@@ -27,9 +27,14 @@ def shapes_read(policy: WMRSSMPolicy | LatentPolicy) -> dict[str, tuple[int, ...
 
 def reward_key(policy: WMRSSMPolicy | LatentPolicy) -> str:
     """The column that the world model's reward head learned; wm_iql's own `reward_key` may be another."""
+    return world_model_config(policy).reward_key
+
+
+def world_model_config(policy: WMRSSMPolicy | LatentPolicy) -> WMRSSMConfig:
+    """The configuration that the world model, a policy's own or the one it is on, was trained with."""
     config = policy.config if isinstance(policy, WMRSSMPolicy) else policy.config.world_model
-    assert isinstance(config, WMRSSMConfig)  # the readers of this module dream with it
-    return config.reward_key
+    assert isinstance(config, WMRSSMConfig)  # `load_world_model` refuses others
+    return config
 
 
 def check_features(policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata) -> None:

@@ -6,6 +6,7 @@ from base64 import b64encode
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+MAX_NAME = 32  # characters of a name that stands in a figure
 SVG, PNG, WEBP, MP4 = "image/svg+xml", "image/png", "image/webp", "video/mp4"
 
 
@@ -14,9 +15,9 @@ def data_uri(content: bytes, mime_type: str) -> str:
     return f"data:{mime_type};base64,{b64encode(content).decode()}"
 
 
-def short(name: str, limit: int = 32) -> str:
+def short(name: str) -> str:
     """A name that leaves room for the figure it stands beside."""
-    return name if len(name) <= limit else f"{name[: limit - 1]}…"
+    return name if len(name) <= MAX_NAME else f"{name[: MAX_NAME - 1]}…"
 
 
 def figure_bytes(figure: Figure, mime_type: str) -> bytes:

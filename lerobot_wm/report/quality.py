@@ -11,11 +11,11 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.data.check import check_dataset
 from lerobot_wm.policies.cameras import side_by_side
-from lerobot_wm.report.episodes import episodes_by_task
+from lerobot_wm.report.episodes import episodes_by_task, world_model_config
 from lerobot_wm.report.inline import PNG, SVG, figure_bytes
 from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model
 from lerobot_wm.report.provenance import provenance
-from lerobot_wm.report.quality_dynamics import RESTART, drift, kl_quality, reward_quality
+from lerobot_wm.report.quality_dynamics import drift, kl_quality, reward_quality
 from lerobot_wm.report.quality_episodes import Episode, filter_episodes, read_episodes, start_positions
 from lerobot_wm.report.quality_figures import EXAMPLES_NAME, examples_figure, quality_figures
 from lerobot_wm.report.quality_open_loop import (
@@ -79,6 +79,7 @@ def quality(cfg: QualityConfig) -> Path:
     assert isinstance(world_model, WorldModel)  # as load_world_model checked
     training, episodes = _read_datasets(cfg, cameras)
     n_seen = _count_seen(training, episodes)
+    window_length = world_model_config(policy).window_length
 
     logger.info("Filtering %d episodes", len(training) + len(episodes))
     all_filtered = filter_episodes(world_model, training + episodes)
@@ -108,7 +109,7 @@ def quality(cfg: QualityConfig) -> Path:
             "context": CONTEXT,
             "horizons": HORIZONS,
             "foreground_threshold": FOREGROUND_THRESHOLD,
-            "restart": RESTART,
+            "restart": window_length,
             "probe_frames_per_episode": FRAMES_PER_EPISODE,
             "rssm": asdict(world_model.config),
         },
@@ -119,7 +120,7 @@ def quality(cfg: QualityConfig) -> Path:
         "probes": probe_positions(frames),
         "task_probe": probe_task(frames),
         "kl": kl_quality(episodes, filtered, world_model.config.free_nats),
-        "drift": drift(world_model, episodes, filtered),
+        "drift": drift(world_model, episodes, filtered, window_length),
         "provenance": provenance(),
     }
     cfg.output_dir.mkdir(parents=True, exist_ok=True)

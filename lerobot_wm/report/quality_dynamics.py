@@ -12,7 +12,6 @@ from lerobot_wm.report.quality_open_loop import ALL_TASKS
 from lerobot_wm.world_model.model import WorldModel
 
 DRIFT_STEPS = 101  # step indices 0..100
-RESTART = 25  # steps of a training window, after which the filter has seen more than in training
 KL_BINS = 40
 _PERCENTILES = (5, 25, 50, 75, 95)
 
@@ -86,11 +85,14 @@ def kl_quality(episodes: list[Episode], filtered: list[Filtered], free_nats: flo
 
 
 @torch.no_grad()
-def drift(world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered]) -> list[dict]:
+def drift(
+    world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered], window_length: int
+) -> list[dict]:
     """Reconstruction and KL by step index, over whole episodes.
 
-    Beside the filter that runs from the first frame on stands one that was restarted RESTART - 1 steps before,
-    as training windows are: what it does better at the same frames is drift, the rest is the scene's change.
+    Beside the filter that runs from the first frame on stands one that was restarted so many steps before that it has
+    seen `window_length` frames, as in training: what it does better at the same frames is drift, the rest is the
+    scene's change.
 
     Returns:
         One row per step index: `n_episodes` that reach it, mean `kl`, `psnr` and `restarted_psnr` in dB (None
@@ -101,9 +103,11 @@ def drift(world_model: WorldModel, episodes: list[Episode], filtered: list[Filte
         steps = min(len(episode.actions), DRIFT_STEPS)
         truth = episode.images(slice(steps))  # (T, C, 64, 64)
         restarted = torch.full((steps,), torch.nan)
-        if steps >= RESTART:
-            latents = _restarted_latents(world_model, loop.embeds[:steps], episode.actions[:steps])
-            restarted[RESTART - 1 :] = _squared_error(world_model, latents, truth[RESTART - 1 :])
+        if steps >= window_length:
+            latents = _restarted_latents(
+                world_model, loop.embeds[:steps], episode.actions[:steps], window_length
+            )
+            restarted[window_length - 1 :] = _squared_error(world_model, latents, truth[window_length - 1 :])
         values = {
             "step": range(steps),
             "kl": loop.kl[:steps].numpy(),
@@ -125,12 +129,14 @@ def drift(world_model: WorldModel, episodes: list[Episode], filtered: list[Filte
     ]
 
 
-def _restarted_latents(world_model: WorldModel, embeds: Tensor, actions: Tensor) -> Tensor:
-    """s_t of filters that start RESTART - 1 steps before t: (T, E), (T, A) -> (T - RESTART + 1, D+S)."""
+def _restarted_latents(
+    world_model: WorldModel, embeds: Tensor, actions: Tensor, window_length: int
+) -> Tensor:
+    """s_t of filters that start W - 1 steps before t: (T, E), (T, A) -> (T - W + 1, D+S)."""
     device = world_model.action_scaling.offset.device
     windows = [
-        x.unfold(0, RESTART, 1).movedim(-1, 1).to(device) for x in (embeds, actions)
-    ]  # (N, RESTART, ·)
+        x.unfold(0, window_length, 1).movedim(-1, 1).to(device) for x in (embeds, actions)
+    ]  # (N, W, ·)
     return world_model.filter_embeds(*windows).last().latent
 
 

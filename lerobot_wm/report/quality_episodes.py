@@ -30,7 +30,7 @@ class Episode:
 
     task: str
     variation: int
-    frames: list[Tensor]  # of each camera (T, H, W, C) uint8, a view of the memory-mapped cache
+    frames: list[Tensor]  # of each camera (T, 64, 64, C) uint8, a view of the memory-mapped cache
     actions: Tensor  # (T, A)
     proprio: Tensor  # (T, P)
     env_state: Tensor  # (T, 39)
@@ -113,7 +113,9 @@ def read_episodes(
         table = table[table["task_index"].isin([i for i, task in enumerate(tasks) if task in of_tasks])]
     chosen = choose_episodes(table.drop_duplicates("episode_index"), per_task, seed)
     dataset = LeRobotDataset(repo_id, root=root, episodes=chosen)
-    of_cameras = [camera_frames(dataset, key) for key in cameras]  # (N, H, W, C) each, by absolute index
+    of_cameras = [
+        camera_frames(dataset, key, (IMAGE_SIZE, IMAGE_SIZE)) for key in cameras
+    ]  # (N, 64, 64, C) each, by absolute index
     columns = {
         key: column_tensor(dataset.hf_dataset, key, tuple(dataset.meta.features[key]["shape"]))
         for key in (*NEEDED, "episode_index", "index", "task_index")

@@ -30,10 +30,10 @@ def world_model_loss(
     """Sum of the reconstruction terms and the KL, clamped per step at the free nats (as TorchRL's Dreamer).
 
     Args:
-        errors: Per-step terms, each (B, T): `image_loss`, and `reward_loss`, `proprio_loss` where modelled.
+        errors: Per-step terms, each (B, T): `image_loss`; `reward_loss`, `action_loss`, `proprio_loss` if modelled.
         kl: KL(posterior || prior) in nats, (B, T).
         valid: (B, T) bool; steps that count.
-        config: Weights β (`kl_scale`), `free_nats` and `reward_scale`.
+        config: Weights β (`kl_scale`), `reward_scale` and `action_scale`, and `free_nats`.
 
     Returns:
         The scalar loss and the named parts (detached scalars), the unclamped KL and the share of steps under

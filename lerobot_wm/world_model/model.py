@@ -74,8 +74,6 @@ class WorldModel(LatentModel):
         prev_actions: Tensor,
         state: RSSMState | None = None,
         proprio: Tensor | None = None,
-        *,
-        sample: bool = False,
     ) -> RSSMState:
         """Filter (B, T) frames given the action before each: the streaming form, resumed from `state`.
 
@@ -84,42 +82,41 @@ class WorldModel(LatentModel):
             prev_actions: a_{t-1}, (B, T, A) in the dataset's units; the first is not read where an episode starts.
             state: s before the first frame, (B, ·); None starts an episode.
             proprio: (B, T, P), with `config.use_proprio`.
-            sample: Draw z_t instead of taking the posterior mean.
 
         Returns:
-            s_t for every frame, (B, T, ·).
+            s_t for every frame, (B, T, ·); z_t is the posterior mean.
         """
         embeds = self.embed(images, proprio)
-        return self._observe(embeds, self.action_scaling(prev_actions), state, sample=sample)[0]
+        return self._observe(embeds, self.action_scaling(prev_actions), state)[0]
 
-    def filter(
-        self, images: Tensor, actions: Tensor, proprio: Tensor | None = None, *, sample: bool = False
-    ) -> RSSMState:
+    def filter(self, images: Tensor, actions: Tensor, proprio: Tensor | None = None) -> RSSMState:
         """Filter whole episodes: as `observe`, given the action executed *at* each frame.
 
         Args:
             images: o_t, (B, T, C, 64, 64) in [0, 1], from an episode's first frame on.
             actions: a_t, (B, T, A); the last is not used.
             proprio: (B, T, P), with `config.use_proprio`.
-            sample: Draw z_t instead of taking the posterior mean.
 
         Returns:
-            s_t for every frame, (B, T, ·).
+            s_t for every frame, (B, T, ·); z_t is the posterior mean.
         """
-        return self.filter_embeds(self.embed(images, proprio), actions, sample=sample)
+        return self.filter_embeds(self.embed(images, proprio), actions)
 
     def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> RSSMState:
-        """`filter` for images that are embedded already: embeds (B, T, 1024), actions a_t (B, T, A)."""
+        """`filter` for images that are embedded already: embeds (B, T, 1024), actions a_t (B, T, A).
+
+        With `sample` z_t is drawn.
+        """
         return self._observe(embeds, self._shift(actions), sample=sample)[0]
 
     def filter_with_kl(self, embeds: Tensor, actions: Tensor) -> tuple[RSSMState, Tensor]:
         """`filter_embeds`, and how far each image moved the belief: KL(posterior || prior) in nats, (B, T)."""
-        states, posterior = self._observe(embeds, self._shift(actions), sample=False)
+        states, posterior = self._observe(embeds, self._shift(actions))
         return states, posterior.kl(self.rssm.prior(states.deter))
 
-    def imagine(self, state: RSSMState, actions: Tensor, *, sample: bool = False) -> RSSMState:
-        """Predict s_{t+1} ... s_{t+H} from s_t (B, ·) under actions a_t ... a_{t+H-1}, (B, H, A)."""
-        return self.rssm.imagine(state, self.action_scaling(actions), sample=sample)
+    def imagine(self, state: RSSMState, actions: Tensor) -> RSSMState:
+        """Predict s_{t+1} ... s_{t+H}, z at the prior's mean, from s_t (B, ·) under a_t ... a_{t+H-1}, (B, H, A)."""
+        return self.rssm.imagine(state, self.action_scaling(actions))
 
     def decode(self, latents: Tensor) -> Tensor:
         """Images (..., C, 64, 64), clipped to [0, 1], from latents (..., D+S)."""
@@ -145,7 +142,7 @@ class WorldModel(LatentModel):
         rewards: Tensor | None = None,
         proprio: Tensor | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The training loss on windows: reconstruction, reward and KL with free nats.
+        """The training loss on windows: reconstruction, reward, action, and KL with free nats.
 
         A window starts from the zero state and, for the previous action, the middle of their range (zeros
         without `config.centred_start`), wherever in its episode it lies. The reward
@@ -226,7 +223,7 @@ class WorldModel(LatentModel):
         return random_crop(images.flatten(0, 1), self.config.image_shift).unflatten(0, images.shape[:2])
 
     def _observe(
-        self, embeds: Tensor, prev_actions: Tensor, state: RSSMState | None = None, *, sample: bool
+        self, embeds: Tensor, prev_actions: Tensor, state: RSSMState | None = None, *, sample: bool = False
     ) -> tuple[RSSMState, DiagonalNormal]:
         """The RSSM's `observe`, from scaled actions a_{t-1} (B, T, A) as far as it is told them; None starts anew."""
         if state is None:

@@ -114,13 +114,12 @@ class RSSM(nn.Module):
         with torch.autocast(deter.device.type, enabled=False):
             return self._normal(self.prior_params(F.elu(self.prior_hidden(deter))))
 
-    def imagine(self, state: RSSMState, actions: Tensor, *, sample: bool = False) -> RSSMState:
-        """Roll the prior forward without images.
+    def imagine(self, state: RSSMState, actions: Tensor) -> RSSMState:
+        """Roll the prior forward without images; z is its mean.
 
         Args:
             state: s_t, (B, ·).
             actions: a_t, a_{t+1}, ..., (B, H, A): the first is the one executed in `state`.
-            sample: Draw z from the prior instead of taking its mean.
 
         Returns:
             s_{t+1} ... s_{t+H}, (B, H, ·).
@@ -130,8 +129,7 @@ class RSSM(nn.Module):
         with torch.autocast(actions.device.type, enabled=False):
             for action in actions.float().unbind(1):
                 d = self.gru(F.elu(self.recurrent_input(torch.cat([z, action], -1))), d)  # (B, D)
-                prior = self.prior(d)  # (B, S)
-                z = prior.mean + prior.std * torch.randn_like(prior.std) if sample else prior.mean
+                z = self.prior(d).mean  # (B, S)
                 deters.append(d)
                 stochs.append(z)
         return RSSMState(torch.stack(deters, 1), torch.stack(stochs, 1))

@@ -4,6 +4,7 @@ import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -132,3 +133,28 @@ def test_a_gradient_that_is_not_finite_is_named(whole_dataset: Path, tmp_path: P
         )
         with pytest.raises(DivergenceError, match=f"{broken} is NaN or Inf {own} the episodes 0, 1, 3. "):
             watch.check(loss, served, tmp_path / "last", 2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "advice"),
+    [
+        ({"lr": 1e-3, "dtype": "bfloat16"}, "a lower --policy.lr, or train in --policy.dtype=float32."),
+        ({"lr": 1e-3, "dtype": "float32"}, "a lower --policy.lr."),
+        ({"optimizer_lr": 1e-3}, "a lower --policy.optimizer_lr."),
+    ],
+)
+def test_advice_on_divergence_names_flags_of_the_policy(
+    settings: dict, advice: str, whole_dataset: Path, tmp_path: Path
+) -> None:
+    dataset = LeRobotDataset("test/faults", root=whole_dataset)
+    loader = DataLoader(dataset, batch_sampler=[[0]])
+    served = RamLoader(loader, loader.batch_sampler, CPU, cameras={})
+    next(iter(served))
+    model, watch = Root(), LossWatch()
+    model.config = SimpleNamespace(**settings)
+    watch.attach(model)
+    loss, _ = model.forward(-1.0)
+    loss.backward()
+    with pytest.raises(DivergenceError) as end:
+        watch.check(loss, served, tmp_path / "last")
+    assert str(end.value).endswith(f"Train again with {advice}")

@@ -14,6 +14,7 @@ from lerobot_wm.hub.eval_command import eval_command
 from lerobot_wm.hub.markdown import code, escaped
 from lerobot_wm.hub.model_card import TrainingData, model_card
 from lerobot_wm.pipeline.publish import check_records
+from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.report.records import Record
@@ -60,7 +61,10 @@ def test_no_name_breaks_a_card() -> None:
     run = TrainPipelineConfig(dataset=DatasetConfig(repo_id="user/x"), policy=config)
     data = TrainingData("user/x", 2, 100, NASTY, "0123456789abcdef", None)
     policy_class = get_policy_class("wm_rssm")
-    card = model_card(policy_class, config, "user/wm", run, data, imagined_tasks=NASTY, makes_latents=True)
+    card = model_card(
+        *(policy_class, config, "user/wm", run, data),
+        **{"imagined_tasks": NASTY, "features_read": config.features_read, "makes_latents": True},
+    )
     again = ModelCard(str(card))
     assert again.data.license == "apache-2.0"
     shown = html(again.text)
@@ -137,3 +141,18 @@ def test_records_of_another_policy_are_refused(other: dict, said: str) -> None:
     check_records([RECORD], "wm_bc", 0)
     with pytest.raises(ValueError, match=said):
         check_records([RECORD, {**RECORD, **other}], "wm_bc", 0)
+
+
+def test_a_backbones_card_names_what_it_reads() -> None:
+    """Its configuration keeps the dataset's other features."""
+    config = FrozenBackboneConfig(device="cpu", image_key="observation.image")
+    config.input_features = features("VISUAL", "observation.image", (3, 64, 64))
+    config.input_features |= features("STATE", "observation.state", (4,))
+    config.output_features = features("ACTION", "action", (4,))
+    card = model_card(
+        *(get_policy_class("frozen_backbone"), config, "user/resnet", None, None),
+        **{"features_read": config.features_read, "makes_latents": True},
+    )
+    inputs = str(card).split("| input | shape |")[1].split("\n\n")[0]
+    assert "observation.image" in inputs
+    assert "observation.state" not in inputs

@@ -95,11 +95,11 @@ class WMRSSMConfig(LRDecayConfig, CompileConfig, WorldModelConfig, RewardConfig)
         """
         super().validate_features()
         sizes = {
-            "action_dim": feature_dim(self.output_features, ACTION, "The dataset"),
+            "action_dim": feature_dim(self.output_features, ACTION),
             "image_channels": self.image_shape[0],
         }
         if self.rssm.use_proprio:
-            sizes["proprio_dim"] = feature_dim(self.input_features, OBS_STATE, "The dataset")
+            sizes["proprio_dim"] = feature_dim(self.input_features, OBS_STATE)
         for name, size in sizes.items():
             known = getattr(self.rssm, name)
             if known not in (0, size):
