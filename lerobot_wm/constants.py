@@ -63,3 +63,9 @@ ROBOT_TYPE = "metaworld"
 # The default camera, LeRobot's adjusted corner2: it shows every task's objects.
 CAMERA_NAME = "corner2"
 CAMERA_POSITION = (0.75, 0.075, 0.7)
+
+# Files that one command writes and others read.
+RECORDS_NAME = "records.jsonl"  # one line per rollout
+QUALITY_NAME = "quality.json"
+EVAL_INFO_NAME = "eval_info.json"
+TRAIN_LOG_NAME = "train_log.jsonl"

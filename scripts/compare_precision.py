@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lerobot_wm.pipeline.train import TRAIN_LOG_NAME
+from lerobot_wm.constants import TRAIN_LOG_NAME
 from lerobot_wm.report.comparison import compare
 from lerobot_wm.report.provenance import provenance
 from lerobot_wm.report.records import Record, read_records

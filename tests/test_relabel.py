@@ -12,6 +12,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.pipeline.relabel import relabel
 from tests.flags import DATASET_FLAGS
 
@@ -82,3 +83,9 @@ def test_what_is_no_reward_is_refused(reward: str, demos: LeRobotDataset, tmp_pa
 def test_a_folder_is_never_overwritten(demos: LeRobotDataset, tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match="another --output_root"):
         relabel(demos, "next.dense_reward", "test/other", tmp_path)
+
+
+def test_one_writer_at_a_time(demos: LeRobotDataset, tmp_path: Path) -> None:
+    """Another would remove what this one has begun."""
+    with sole_writer(tmp_path / "other"), pytest.raises(BlockingIOError, match="another process is writing"):
+        relabel(demos, "next.dense_reward", "test/other", tmp_path / "other")

@@ -26,6 +26,7 @@ from lerobot_wm.constants import (
 )
 
 COLLECTION_RECORD = Path("meta", "collection.json")  # how `lerobot-wm collect` made the dataset
+RELABEL_RECORD = Path("meta", "relabel.json")  # which column `lerobot-wm relabel` made the reward
 STATE_NAMES = ["x", "y", "z", "gripper"]
 
 

@@ -10,6 +10,7 @@ from lerobot_wm.constants import (
     REPORTED_VARIATION_SET,
     SELECTION_VARIATION_SET,
 )
+from lerobot_wm.data.schema import COLLECTION_RECORD, RELABEL_RECORD
 from lerobot_wm.experiment.commands import Dataset, lerobot_wm
 from lerobot_wm.experiment.preset import Preset
 from lerobot_wm.experiment.stage import Stage
@@ -43,7 +44,7 @@ class Demonstrations:
             kind="relabel",
             argv=lerobot_wm("relabel", flags),
             folder=folder,
-            artefact=folder / "meta" / "relabel.json",
+            artefact=folder / RELABEL_RECORD,
             needs=(source.made_by,),
         )
         return Dataset(stage, repo_id)
@@ -71,7 +72,7 @@ class Demonstrations:
             kind="collect",
             argv=lerobot_wm("collect", flags),
             folder=folder,
-            artefact=folder / "meta" / "collection.json",
+            artefact=folder / COLLECTION_RECORD,
             checkpoint=shards_folder(folder),
             takes_workers=True,
         )

@@ -8,7 +8,7 @@ from typing import IO
 from rich.console import Console
 from rich.table import Column, Table
 
-from lerobot_wm.constants import REPORTED_VARIATION_SET
+from lerobot_wm.constants import RECORDS_NAME, REPORTED_VARIATION_SET
 from lerobot_wm.cores import usable_cores
 from lerobot_wm.experiment.arms import Arm
 from lerobot_wm.experiment.ledger import Ledger
@@ -62,7 +62,7 @@ class Experiment:
         for arm, seed in self._open_runs():
             stages = self.plan.evaluations(arm, seed)
             if all(stage.finished for stage in stages):
-                self.ledger.add(arm.name, seed, [stage.folder / "records.jsonl" for stage in stages])
+                self.ledger.add(arm.name, seed, [stage.folder / RECORDS_NAME for stage in stages])
 
     def show(self, console: Console) -> None:
         """Print every stage and its state."""

@@ -14,7 +14,8 @@ from lerobot.utils.constants import (
     TRAINING_STATE_DIR,
 )
 
-from lerobot_wm.constants import ENV_TYPE, REPORTED_VARIATION_SET
+from lerobot_wm.constants import ENV_TYPE, QUALITY_NAME, RECORDS_NAME, REPORTED_VARIATION_SET
+from lerobot_wm.data.latents import RECORD_PATH
 from lerobot_wm.experiment.arms import WM_RSSM, Arm, Encoder
 from lerobot_wm.experiment.commands import Checkpoint, Dataset, lerobot_wm
 from lerobot_wm.experiment.demonstrations import Demonstrations
@@ -73,7 +74,7 @@ class Plan:
             kind="quality",
             argv=lerobot_wm("quality", {**flags, "output_dir": folder}),
             folder=folder,
-            artefact=folder / "quality.json",
+            artefact=folder / QUALITY_NAME,
             needs=(world_model.made_by, training.made_by, held_out.made_by),
         )
 
@@ -104,7 +105,7 @@ class Plan:
             kind="encode",
             argv=lerobot_wm("encode", {**flags, "output_repo_id": repo_id, "output_root": folder}),
             folder=folder,
-            artefact=folder / "meta" / "latents.json",
+            artefact=folder / RECORD_PATH,
             needs=(source.made_by, checkpoint.made_by),
             checkpoint=parts_folder(folder),
         )
@@ -172,7 +173,7 @@ class Plan:
             kind="evaluate_task" if task else "evaluate",
             argv=lerobot_wm("eval", flags, *arm.eval_flags),
             folder=folder,
-            artefact=folder / "records.jsonl",
+            artefact=folder / RECORDS_NAME,
             needs=(policy.made_by,),
             takes_workers=True,
         )
@@ -193,7 +194,7 @@ class Plan:
             kind="expert",
             argv=lerobot_wm("expert", flags),
             folder=folder,
-            artefact=folder / "records.jsonl",
+            artefact=folder / RECORDS_NAME,
             takes_workers=True,
         )
 

@@ -2,10 +2,9 @@
 
 from lerobot.configs import FeatureType, PreTrainedConfig
 
-from lerobot_wm.constants import ENV_TYPE, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, TASK_SETS
+from lerobot_wm.constants import ENV_TYPE, IMAGE_SIZE, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, TASK_SETS
 from lerobot_wm.envs.cameras import CAMERAS
 from lerobot_wm.envs.tasks import all_tasks, task_description
-from lerobot_wm.nn.conv import IMAGE_SIZE
 
 
 def eval_command(config: PreTrainedConfig, repo_id: str) -> str:

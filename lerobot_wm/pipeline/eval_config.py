@@ -7,6 +7,7 @@ from lerobot.configs.default import EvalConfig, WandBConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_wm.constants import RECORDS_NAME
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.variations import is_seen, split_variations
 from lerobot_wm.policies.fits import check_environment_fits
@@ -79,7 +80,7 @@ class EvaluateConfig(EvalPipelineConfig):
     @property
     def records_file(self) -> Path:
         """The records file to write."""
-        return self.records or Path(self.output_dir) / "records.jsonl"
+        return self.records or Path(self.output_dir) / RECORDS_NAME
 
     @property
     def arm_name(self) -> str:

@@ -19,6 +19,7 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 from tqdm import tqdm
 
+from lerobot_wm.constants import EVAL_INFO_NAME
 from lerobot_wm.cores import usable_cores
 from lerobot_wm.pipeline.eval_config import EvaluateConfig
 from lerobot_wm.pipeline.processors import check_policy_path, check_processors
@@ -126,7 +127,7 @@ def _write_info(cfg: EvaluateConfig, records: list[Record], seconds: float) -> N
         "eval_s": seconds,
         "provenance": provenance(),
     }
-    (cfg.output_dir / "eval_info.json").write_text(json.dumps(info, indent=2) + "\n")
+    (cfg.output_dir / EVAL_INFO_NAME).write_text(json.dumps(info, indent=2) + "\n")
 
 
 @parser.wrap()

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from tqdm import tqdm
 
-from lerobot_wm.constants import MAX_EPISODE_STEPS, NUM_VARIATIONS, REPORTED_VARIATION_SET
+from lerobot_wm.constants import MAX_EPISODE_STEPS, NUM_VARIATIONS, RECORDS_NAME, REPORTED_VARIATION_SET
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import check_variation_set, is_seen, parse_variations
@@ -61,7 +61,7 @@ class ExpertConfig:
     @property
     def records_file(self) -> Path:
         """The records file to write."""
-        return self.output_dir / "records.jsonl"
+        return self.output_dir / RECORDS_NAME
 
 
 def roll_out_expert(cfg: ExpertConfig) -> list[Record]:

@@ -14,6 +14,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.pipeline.source import SourceConfig
 
 
@@ -42,11 +43,18 @@ def initialise(cfg: InitConfig) -> Path:
 
     Raises:
         FileExistsError: It is there already.
+        BlockingIOError: Another process writes it.
         ValueError: The policy does not fit the dataset.
     """
     folder = cfg.output_dir / PRETRAINED_MODEL_DIR
-    if folder.exists():
-        raise FileExistsError(f"{folder} is there already: choose another --output_dir, or remove it.")
+    with sole_writer(folder):
+        if folder.exists():
+            raise FileExistsError(f"{folder} is there already: choose another --output_dir, or remove it.")
+        _write(cfg, folder)
+    return folder
+
+
+def _write(cfg: InitConfig, folder: Path) -> None:
     meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
     set_seed(cfg.seed)
     policy = make_policy(cfg.policy, ds_meta=meta)
@@ -55,7 +63,7 @@ def initialise(cfg: InitConfig) -> Path:
     policy.save_pretrained(partial)
     for processor in make_pre_post_processors(cfg.policy, dataset_stats=meta.stats):
         processor.save_pretrained(partial)
-    return partial.rename(folder)
+    partial.rename(folder)
 
 
 def main() -> None:

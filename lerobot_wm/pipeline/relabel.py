@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from lerobot_wm.constants import REWARD
 from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.lock import sole_writer
+from lerobot_wm.data.schema import RELABEL_RECORD
 from lerobot_wm.pipeline.source import SourceConfig
-
-RELABEL_RECORD = Path("meta", "relabel.json")
 
 
 @dataclass
@@ -51,10 +51,9 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
 
     Raises:
         FileExistsError: `output_root` is there already.
+        BlockingIOError: Another process writes it.
         ValueError: The dataset has no such column, or one of another kind than its `next.reward`.
     """
-    if output_root.exists():
-        raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
     kinds = {name: (feature["dtype"], *feature["shape"]) for name, feature in source.meta.features.items()}
     if reward not in kinds or kinds[reward] != kinds.get(REWARD):
         alike = [name for name in kinds if name.startswith("next.") and kinds[name] == kinds.get(REWARD)]
@@ -62,6 +61,16 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
             f"--reward={reward}: {source.repo_id} has no such column of the kind of its '{REWARD}', "
             f"{kinds.get(REWARD)}. Columns of that kind: {', '.join(alike) or 'none'}."
         )
+    with sole_writer(output_root):
+        if output_root.exists():
+            raise FileExistsError(
+                f"{output_root} is there already: choose another --output_root, or remove it."
+            )
+        _write(source, reward, output_root)
+    return LeRobotDataset(output_repo_id, root=output_root)
+
+
+def _write(source: LeRobotDataset, reward: str, output_root: Path) -> None:
     partial = output_root.with_name(f"{output_root.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     root = Path(source.root)
@@ -87,7 +96,6 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
     }
     (partial / RELABEL_RECORD).write_text(json.dumps(record, indent=2) + "\n")
     partial.replace(output_root)
-    return LeRobotDataset(output_repo_id, root=output_root)
 
 
 def _with_columns(file: Path, sources: dict[str, str]) -> pa.Table:

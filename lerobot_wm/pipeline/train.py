@@ -12,7 +12,7 @@ from lerobot.scripts.lerobot_train import train as lerobot_train
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.logging_utils import MetricsTracker
 
-from lerobot_wm.constants import OBS_LATENT
+from lerobot_wm.constants import OBS_LATENT, TRAIN_LOG_NAME
 from lerobot_wm.data.check import check_dataset, damage_named
 from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.hub.errors import check_can_push, check_dataset_version
@@ -27,8 +27,6 @@ from lerobot_wm.policies.fine_tuning import names_given_by
 from lerobot_wm.policies.fits import check_dataset_fits
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.world_model_config import WorldModelConfig
-
-TRAIN_LOG_NAME = "train_log.jsonl"
 
 
 class TrainLog(logging.Filter):

@@ -7,6 +7,7 @@ import draccus
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from rich.console import Console
 
+from lerobot_wm.data.check import check_dataset
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.curves import curve_figures, read_logs
@@ -72,11 +73,12 @@ def report(cfg: ReportConfig) -> Path:
         The page.
 
     Raises:
-        ValueError, FileNotFoundError: an input is missing or is not what its flag takes.
+        ValueError, FileNotFoundError: an input is missing, not whole or not what its flag takes.
     """
     cfg.validate()
     meta = policy = None
     if cfg.dataset.repo_id is not None:
+        check_dataset(cfg.dataset.repo_id, cfg.dataset.root)
         meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root)
         if cfg.world_model_path is not None:
             policy = load_world_model(cfg.world_model_path)

@@ -7,9 +7,9 @@ from pathlib import Path
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
+from lerobot_wm.constants import TRAIN_LOG_NAME
 from lerobot_wm.report.inline import short
 
-LOG_NAME = "train_log.jsonl"
 # LeRobot's counters and timings, which say nothing about learning.
 BOOKKEEPING = {"steps", "samples", "episodes", "epochs", "update_s", "dataloading_s", "samples_per_s"}
 # One run as {name: [(step, value), ...]}.
@@ -36,7 +36,7 @@ def read_curves(run: Path) -> Curves:
     Raises:
         FileNotFoundError: the folder holds no log.
     """
-    path = run / LOG_NAME
+    path = run / TRAIN_LOG_NAME
     if not path.exists():
         raise FileNotFoundError(
             f"{path} is missing: --train_logs takes output folders of `lerobot-wm train`."

@@ -9,6 +9,7 @@ import draccus
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
+from lerobot_wm.constants import QUALITY_NAME
 from lerobot_wm.data.check import check_dataset
 from lerobot_wm.policies.cameras import side_by_side
 from lerobot_wm.report.episodes import episodes_by_task, world_model_config
@@ -30,7 +31,6 @@ from lerobot_wm.world_model.model import WorldModel
 
 logger = logging.getLogger(__name__)
 
-QUALITY_NAME = "quality.json"
 # Training episodes of each task that probes are fitted on, spread over the training data's variations.
 PROBE_EPISODES_PER_TASK = 40
 

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_wm.constants import EVAL_INFO_NAME
 from lerobot_wm.report.inline import MP4, data_uri
 
 # All videos of the grid together; as data URIs they take a third more. 500 steps at 256x256 take 150 kB.
@@ -49,7 +50,7 @@ def read_evaluation(folder: Path) -> Evaluation:
         FileNotFoundError: the folder is not the output of `lerobot-wm eval`.
         ValueError: a video has a name that `lerobot-wm eval` does not give.
     """
-    path = folder / "eval_info.json"
+    path = folder / EVAL_INFO_NAME
     if not path.exists():
         raise FileNotFoundError(f"{path} is missing: --videos takes output folders of `lerobot-wm eval`.")
     info = json.loads(path.read_text())
