@@ -9,6 +9,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import torch
+from lerobot.datasets.dataset_tools import add_features, modify_features
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.fingerprint import dataset_fingerprint
@@ -89,3 +90,23 @@ def test_one_writer_at_a_time(demos: LeRobotDataset, tmp_path: Path) -> None:
     """Another would remove what this one has begun."""
     with sole_writer(tmp_path / "other"), pytest.raises(BlockingIOError, match="another process is writing"):
         relabel(demos, "next.dense_reward", "test/other", tmp_path / "other")
+
+
+def test_a_column_of_ones_own_needs_no_statistics(demos: LeRobotDataset, tmp_path: Path) -> None:
+    """LeRobot's `add_features` writes none."""
+    values = np.linspace(0, 1, demos.num_frames, dtype=np.float32)
+    feature = {"dtype": "float32", "shape": (1,), "names": None}
+    source = add_features(demos, {"next.shaped": (values, feature)}, tmp_path / "source", "test/source")
+    shaped = relabel(source, "next.shaped", "test/shaped", tmp_path / "shaped")
+    np.testing.assert_array_equal(np.ravel(list(shaped.hf_dataset["next.reward"])), values)
+    assert shaped.meta.stats["next.reward"]["mean"] == pytest.approx(values.mean())
+    [file] = (Path(shaped.root) / "meta" / "episodes").rglob("*.parquet")
+    last = pd.read_parquet(file).iloc[-1]
+    assert last["stats/next.reward/min"] == pytest.approx(values[last["dataset_from_index"]])
+
+
+def test_without_a_reward_the_column_is_named_in_training(demos: LeRobotDataset, tmp_path: Path) -> None:
+    without = modify_features(demos, remove_features="next.reward", output_dir=tmp_path / "without")
+    with pytest.raises(ValueError, match=r"no 'next\.reward'.*--policy\.reward_key=next\.dense_reward"):
+        relabel(without, "next.dense_reward", "test/other", tmp_path / "other")
+    assert not (tmp_path / "other").exists()

@@ -122,7 +122,8 @@ def test_encoding_needs_every_camera(
     demos_root: Path, world_model_path: Path, tmp_path: Path, lerobot_wm_command: Command
 ) -> None:
     with pytest.raises(
-        ValueError, match=r"watches .*corner2, .*topview; test/demos has .*observation\.image:"
+        ValueError,
+        match=r"watches .*corner2, .*topview; test/demos has .*observation\.image:.*--rename_map of lerobot-wm encode",
     ):
         lerobot_wm_command(
             f"encode --world_model_path={world_model_path} --device=cpu --dataset.repo_id=test/demos",

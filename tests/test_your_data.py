@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train
 
 from tests.documents import blocks, commands
@@ -57,7 +58,14 @@ def test_the_page_works_as_written(
     keys = (FRONT, WRIST, "observation.state")
     item = dataset[0]
     frame = {**{key: item[key][None] for key in keys}, "task": [item["task"]]}
-    [program] = blocks(DOCUMENT, "python")
+    acts, adds_rewards = blocks(DOCUMENT, "python")
     names: dict[str, torch.Tensor] = {"frame": frame}
-    exec(program, names)
+    exec(acts, names)
     assert names["action"].shape == (1, 7)
+    exec(adds_rewards, {})
+    lerobot_wm_command(
+        "train --policy.type=e2e_iql --policy.device=cpu --policy.push_to_hub=false --steps=1 --batch_size=2",
+        "--num_workers=0 --dataset.repo_id=user/robot_rewarded --dataset.root=data/robot_rewarded --output_dir=out",
+    )
+    rewarded = LeRobotDataset("user/robot_rewarded", root="data/robot_rewarded")
+    assert np.flatnonzero(rewarded.hf_dataset.with_format("numpy")["next.reward"][:]).tolist() == [7, 12]

@@ -7,6 +7,8 @@ from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.check_info import MEND, Info, one_line, read_object, shown
 from lerobot_wm.data.errors import DatasetError
 
+_RECOMPUTE = f"{MEND}, or train on a copy that lerobot-edit-dataset --operation.type=recompute_stats makes"
+
 
 def check_stats(info: Info) -> None:
     """Check `meta/stats.json`: LeRobot goes on without it, and then nothing scales actions and proprioception.
@@ -15,6 +17,11 @@ def check_stats(info: Info) -> None:
         DatasetError: It is missing or broken, or lacks finite statistics of the action or proprioception.
     """
     path = info.root / STATS_PATH
+    if not path.is_file():
+        raise DatasetError(
+            f"{path} is missing, which scales actions and proprioception: {_RECOMPUTE}. It has none of images: "
+            "train with --dataset.use_imagenet_stats=false, or LeRobot looks for them."
+        )
     stats = read_object(path)
     for name, of_feature in stats.items():
         try:
@@ -31,8 +38,10 @@ def check_stats(info: Info) -> None:
                 if key not in arrays or arrays[key].size != size or not np.isfinite(arrays[key]).all():
                     raise DatasetError(
                         f"{path}: '{key}' of {name} is {shown(of_feature.get(key))}; expected {size} finite numbers, "
-                        f"as {name} has in info.json: {MEND}."
+                        f"as {name} has in info.json: {_RECOMPUTE}."
                     )
     missing = [name for name in (ACTION, OBS_STATE) if name in info.features and name not in stats]
     if missing:
-        raise DatasetError(f"{path} has no statistics of {', '.join(missing)}, which scale them: {MEND}.")
+        raise DatasetError(
+            f"{path} has no statistics of {', '.join(missing)}, which scale them: {_RECOMPUTE}."
+        )

@@ -136,7 +136,7 @@ def _begin(
         raise ValueError(
             f"The world model watches {', '.join(missing)}; {source.repo_id} has the cameras "
             f"{', '.join(source.meta.camera_keys) or 'none'}: use a dataset with all it watches, or give these names "
-            "to cameras that show the same, by --rename_map."
+            "to cameras that show the same, by --rename_map of lerobot-wm encode."
         )
     [state] = names_before([OBS_STATE], rename_map)
     if state not in source.meta.features:

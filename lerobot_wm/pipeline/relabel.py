@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
 from lerobot.datasets.io_utils import write_stats, write_table_one_row_group_per_episode
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
@@ -52,14 +54,19 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
     Raises:
         FileExistsError: `output_root` is there already.
         BlockingIOError: Another process writes it.
-        ValueError: The dataset has no such column, or one of another kind than its `next.reward`.
+        ValueError: The dataset has no such column, or one of another kind than its `next.reward`, or no `next.reward`.
     """
+    if REWARD not in source.meta.features:
+        raise ValueError(
+            f"{source.repo_id} has no '{REWARD}' that could be replaced: name the column where you train, "
+            f"--policy.reward_key={reward}."
+        )
     kinds = {name: (feature["dtype"], *feature["shape"]) for name, feature in source.meta.features.items()}
-    if reward not in kinds or kinds[reward] != kinds.get(REWARD):
-        alike = [name for name in kinds if name.startswith("next.") and kinds[name] == kinds.get(REWARD)]
+    if reward not in kinds or kinds[reward] != kinds[REWARD]:
+        alike = [name for name in kinds if name.startswith("next.") and kinds[name] == kinds[REWARD]]
         raise ValueError(
             f"--reward={reward}: {source.repo_id} has no such column of the kind of its '{REWARD}', "
-            f"{kinds.get(REWARD)}. Columns of that kind: {', '.join(alike) or 'none'}."
+            f"{kinds[REWARD]}. Columns of that kind: {', '.join(alike) or 'none'}."
         )
     with sole_writer(output_root):
         if output_root.exists():
@@ -82,13 +89,19 @@ def _write(source: LeRobotDataset, reward: str, output_root: Path) -> None:
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, copy)
     for file in (partial / "data").rglob("*.parquet"):
-        write_table_one_row_group_per_episode(_with_columns(file, {REWARD: reward}), file)
+        table = pq.read_table(file)
+        write_table_one_row_group_per_episode(_with_column(table, REWARD, table[reward]), file)
+    episodes = _episode_stats(source, reward)
     for file in (partial / "meta" / "episodes").rglob("*.parquet"):
-        names = pq.read_schema(file).names
-        of_reward = f"stats/{REWARD}/"
-        sources = {name: name.replace(REWARD, reward) for name in names if name.startswith(of_reward)}
-        pq.write_table(_with_columns(file, sources), file)
-    write_stats({**source.meta.stats, REWARD: source.meta.stats[reward]}, partial)
+        table = pq.read_table(file)
+        of_file = [episodes[index] for index in table["episode_index"].to_pylist()]
+        for key in episodes[0]:
+            name = f"stats/{REWARD}/{key}"
+            if name in table.column_names:
+                table = _with_column(table, name, pa.array([stats[key].tolist() for stats in of_file]))
+        pq.write_table(table, file)
+    of_all = aggregate_stats([{REWARD: stats} for stats in episodes])
+    write_stats({**source.meta.stats, **of_all}, partial)
     record = {
         "reward": reward,
         "source_repo_id": source.repo_id,
@@ -98,12 +111,19 @@ def _write(source: LeRobotDataset, reward: str, output_root: Path) -> None:
     partial.replace(output_root)
 
 
-def _with_columns(file: Path, sources: dict[str, str]) -> pa.Table:
-    """A parquet file's table whose columns have the values of others: {column: the one it is taken from}."""
-    table: pa.Table = pq.read_table(file)
-    for name, source in sources.items():
-        table = table.set_column(table.schema.get_field_index(name), name, table[source])
-    return table
+def _with_column(table: pa.Table, name: str, values: pa.ChunkedArray | pa.Array) -> pa.Table:
+    """The table with other values in one of its columns, of the same type."""
+    index = table.schema.get_field_index(name)
+    return table.set_column(index, table.schema.field(index), values.cast(table.schema.field(index).type))
+
+
+def _episode_stats(source: LeRobotDataset, column: str) -> list[dict[str, np.ndarray]]:
+    """Statistics of a column in each episode: a column that LeRobot's `add_features` wrote has none yet."""
+    values = np.stack(source.hf_dataset.with_format("numpy")[column][:]).reshape(len(source), -1)  # (N, 1)
+    rows = (
+        slice(episode["dataset_from_index"], episode["dataset_to_index"]) for episode in source.meta.episodes
+    )
+    return [get_feature_stats(values[row], axis=0, keepdims=False) for row in rows]
 
 
 def main() -> None:

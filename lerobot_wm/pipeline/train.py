@@ -5,7 +5,7 @@ import logging
 from contextlib import nullcontext
 from pathlib import Path
 
-from lerobot.configs import parser
+from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.scripts.lerobot_train import train as lerobot_train
@@ -23,6 +23,7 @@ from lerobot_wm.pipeline.processors import check_policy_path, check_processors
 from lerobot_wm.pipeline.train_resume import clear_unfinished, how_to_go_on, restore_last, stops_explained
 from lerobot_wm.pipeline.training_run import check_run_settings, check_training_state
 from lerobot_wm.policies.cameras import ImagePolicyConfig
+from lerobot_wm.policies.checkpoint import read_config
 from lerobot_wm.policies.fine_tuning import names_given_by
 from lerobot_wm.policies.fits import check_dataset_fits
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
@@ -94,6 +95,20 @@ def check_latents_are_there(cfg: TrainPipelineConfig) -> None:
     )
 
 
+def check_base_is_kept(policy: PreTrainedConfig) -> None:
+    """Refuse to publish a policy in the place of the one it is trained on from, whose `repo_id` it has taken over.
+
+    Raises:
+        ValueError: It would go there.
+    """
+    base = read_config(policy.pretrained_path, policy.pretrained_revision)
+    if policy.repo_id in (base.repo_id, str(policy.pretrained_path)):
+        raise ValueError(
+            f"--policy.repo_id={policy.repo_id} is where the policy of --policy.path is published, which this training "
+            "would replace. Give another --policy.repo_id, or --policy.push_to_hub=false."
+        )
+
+
 @parser.wrap()
 def train(cfg: TrainPipelineConfig) -> None:
     """Train any LeRobot policy as `lerobot-train` does, from the same flags, into the same checkpoints."""
@@ -128,6 +143,8 @@ def train(cfg: TrainPipelineConfig) -> None:
         )
     if cfg.policy.pretrained_path is not None:
         check_processors(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
+        if cfg.policy.push_to_hub and not cfg.resume:
+            check_base_is_kept(cfg.policy)
     if cfg.resume:
         check_training_state(cfg.checkpoint_path)
     accelerator = make_accelerator(cfg)

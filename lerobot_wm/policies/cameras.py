@@ -12,6 +12,8 @@ from lerobot_wm.constants import OBS_IMAGE, OBS_STATE
 from lerobot_wm.data.resize import resize_images
 from lerobot_wm.policies.features import image_keys
 
+_WHITE = 1.01  # resizing and floating point may pass 1 by a little; a camera's bytes never stay below
+
 
 @dataclass
 class ImagePolicyConfig(PreTrainedConfig):
@@ -95,20 +97,26 @@ def camera_images(config: ImagePolicyConfig, batch: Mapping[str, Tensor]) -> Ten
 
 
 def check_observation(config: ImagePolicyConfig, batch: Mapping[str, Any]) -> None:
-    """Check what a policy is shown at test time: each camera (B, C, H, W), and `observation.state` (B, P).
+    """Check what a policy is shown at test time: each camera (B, C, H, W) in [0, 1], and `observation.state` (B, P).
 
     Raises:
-        ValueError: A camera or the state is missing or has another size than in training.
+        ValueError: A camera or the state is missing or has another size than in training, or images are not in [0, 1].
     """
     _check_there(config, batch)
     for key in config.cameras:
+        image = batch[key]
         expected = tuple(config.input_features[key].shape)
-        found = tuple(batch[key].shape[1:])
+        found = tuple(image.shape[1:])
         if found != expected:
             raise ValueError(
                 f"'{key}' is {found}, this policy was trained on {expected} (C, H, W): set the camera or environment "
                 f"to a height of {expected[1]} and a width of {expected[2]} (in --robot.cameras of a robot, by "
                 f"--env.image_size={expected[1]} for metaworld_mt)."
+            )
+        if not image.is_floating_point() or image.max() > _WHITE:
+            raise ValueError(
+                f"'{key}' is {image.dtype} up to {image.max().item():g}; expected floating-point numbers in [0, 1]: "
+                "divide a camera's bytes by 255, as prepare_observation_for_inference of lerobot.policies.utils does."
             )
     check_state(config, batch)
 

@@ -8,6 +8,8 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from torch import Tensor
 
+from lerobot_wm.constants import OBS_IMAGE
+
 # Scaling is part of our models (lerobot_wm.nn.normalize): a policy and the frozen world model inside it were
 # fitted on different statistics, which one processor pipeline cannot hold. LeRobot's normalisers do nothing.
 IDENTITY_NORMALIZATION: dict[str, NormalizationMode] = dict.fromkeys(
@@ -88,8 +90,11 @@ def stat(dataset_stats: dict[str, dict[str, Any]] | None, key: str, name: str) -
         ValueError: The dataset carries no such statistic.
     """
     if not dataset_stats or key not in dataset_stats or name not in dataset_stats[key]:
+        if key.startswith(OBS_IMAGE):
+            mend = "LeRobot can't make it anew for images: leave out --policy.rssm.standardize_images, or record again"
+        else:
+            mend = "lerobot-edit-dataset --operation.type=recompute_stats makes a copy of the dataset that has it"
         raise ValueError(
-            f"The dataset's meta/stats.json has no '{name}' of '{key}', which scales the model's inputs; "
-            "recompute the statistics with `lerobot-edit-dataset --operation.type recompute_stats`."
+            f"The dataset's meta/stats.json has no '{name}' of '{key}', which scales the model's inputs: {mend}."
         )
     return torch.as_tensor(dataset_stats[key][name], dtype=torch.float32).flatten()

@@ -116,7 +116,7 @@ def check_environment_fits(config: PreTrainedConfig, env: EnvConfig, rename_map:
             _check_cameras(config, visual, f"--env.type={env.type}")
         return
     _check_cameras(config, visual, f"--env.type={env.type} --env.camera_name={env.camera_name}")
-    check_observation(config, {key: torch.empty(1, *feature.shape) for key, feature in features.items()})
+    check_observation(config, {key: torch.zeros(1, *feature.shape) for key, feature in features.items()})
     if isinstance(config, LatentPolicyConfig):
         config.check_environment_state(features)
     if isinstance(config, MultiTaskConfig):

@@ -17,6 +17,8 @@ from lerobot_wm.policies.pretrained import StrictPolicy
 
 logger = logging.getLogger(__name__)
 
+_SLACK = 0.05  # of a dataset's range: what noise in a few frames adds
+
 
 class MultiTaskPolicy(StrictPolicy):
     """Base of the policies that act.
@@ -60,7 +62,21 @@ class MultiTaskPolicy(StrictPolicy):
         policy = super().from_pretrained(pretrained_name_or_path, dataset_meta=dataset_meta, **kwargs)
         if dataset_meta is not None:
             policy.add_tasks([str(task) for task in dataset_meta.tasks.index])
+            policy.tell_of_actions_out_of_range(dataset_meta)
         return policy
+
+    def tell_of_actions_out_of_range(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Warn of a dataset whose actions lie where this policy's, scaled as in its first training, cannot go."""
+        stats = dataset_meta.stats or {}
+        low, high = stat(stats, ACTION, "min"), stat(stats, ACTION, "max")  # (A,)
+        lowest, highest = (self.action_scaling.inverse(torch.full_like(low, end)) for end in (-1.0, 1.0))
+        slack = _SLACK * (high - low)
+        for i in torch.nonzero((low < lowest - slack) | (high > highest + slack)).flatten().tolist():
+            logger.warning(
+                "Number %d of the actions goes from %.3g to %.3g in %s; this policy was first trained on %.3g to %.3g "
+                "and cannot command the rest. If it matters, train anew with --policy.type=%s on both datasets.",
+                *(i, low[i], high[i], dataset_meta.repo_id, lowest[i], highest[i], self.config.type),
+            )
 
     def heads(self) -> list[MLP]:
         """The networks that read the observation (B, O), and maybe more after it."""
@@ -105,7 +121,7 @@ class MultiTaskPolicy(StrictPolicy):
         return self.action_scaling.inverse(noisy.clamp(-1, 1))
 
     def one_hot_tasks(self, batch: dict[str, Any], batch_size: int) -> Tensor:
-        """One-hot task ids (B, N) from the batch's task strings.
+        """One-hot task ids (B, N) from the batch's task strings, or from one for all of it.
 
         A policy that knows one task does it whatever it is told: simulators name theirs in other words.
 
@@ -114,6 +130,8 @@ class MultiTaskPolicy(StrictPolicy):
         """
         known = self.config.tasks
         given = batch.get(TASK) or [""] * batch_size  # lerobot-rollout gives "" where it was given none
+        if isinstance(given, str):
+            given = [given] * batch_size
         names = [known[0]] * batch_size if len(known) == 1 else given
         if "" in set(names) - set(known):
             raise ValueError(

@@ -1,6 +1,6 @@
 """Strict loading of checkpoints."""
 
-from copy import deepcopy
+from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,6 +11,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from safetensors import SafetensorError
+from torch import Tensor
 
 from lerobot_wm.hub.model_card import TrainingData, model_card
 from lerobot_wm.policies.checkpoint import WHOLE, not_finite, read_config
@@ -77,6 +78,16 @@ class StrictPolicy(PreTrainedPolicy):
             fit_to_dataset(config, saved, dataset_meta)
             kwargs["dataset_meta"] = dataset_meta
         return super().from_pretrained(pretrained_name_or_path, config=config, strict=strict, **kwargs)
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """LeRobot's, without the revision of the checkpoint it was trained on from.
+
+        LeRobot would look for that revision in this one's repository when it loads it by name.
+        """
+        super()._save_pretrained(save_directory, state_dict)
+        config = copy(self.config)
+        config.pretrained_revision = None
+        config._save_pretrained(save_directory)
 
     @classmethod
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:

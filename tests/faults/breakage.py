@@ -142,7 +142,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
         f"{INFO}: feature 'observation.images./../../x' has a name",
     ),
     "stats.json cut short": (partial(cut, name=STATS), f"{STATS} cannot be read"),
-    "stats.json missing": (partial(remove, name=STATS), f"{STATS} is missing"),
+    "stats.json missing": (partial(remove, name=STATS), f"{STATS} is missing, which scales"),
     "no statistics of the action": (
         partial(set_entry, name=STATS, keys=["action"], value={}),
         f"{STATS}: 'min' of action",

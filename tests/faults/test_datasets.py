@@ -16,7 +16,7 @@ from lerobot_wm.data.errors import DatasetError
 from lerobot_wm.pipeline.merge import merge_datasets
 from lerobot_wm.pipeline.source import SourceConfig
 from tests.documents import ROOT
-from tests.faults.breakage import DATA, FAULTS, VIDEO, damage, remove
+from tests.faults.breakage import DATA, FAULTS, STATS, VIDEO, damage, remove
 from tests.faults.conftest import WIDE
 
 
@@ -34,6 +34,17 @@ def test_a_broken_dataset_is_refused(fault: str, dataset: Path) -> None:
     assert message.startswith(f"{dataset}/{begins}")
     assert "\n" not in message
     assert len(message) < len(str(dataset)) + 500
+
+
+def test_missing_statistics_are_mended_as_the_message_says(dataset: Path, tmp_path: Path) -> None:
+    remove(dataset, STATS)
+    with pytest.raises(DatasetError, match=r"lerobot-edit-dataset --operation\.type=recompute_stats"):
+        check_dataset("test/faults", dataset)
+    copy = tmp_path / "copy"
+    flags = f"--repo_id=test/faults --root={dataset} --new_root={copy} --operation.type=recompute_stats"
+    command = [sys.executable, "-m", "lerobot.scripts.lerobot_edit_dataset", *flags.split()]
+    subprocess.run(command, check=True, capture_output=True)
+    check_dataset("test/faults", copy)
 
 
 def test_damage_inside_the_data_is_found_when_it_is_opened(dataset: Path) -> None:

@@ -11,6 +11,7 @@ TRAIN = "train --policy.type=wm_rssm --policy.device=cpu --steps=1 --num_workers
 ENCODE = (
     "encode --output_repo_id=user/x --output_root={folder}/x --dataset.repo_id=user/demos --world_model_path="
 )
+GO_ON = "train --policy.path=user/wm --policy.device=cpu --steps=1 --num_workers=0 --output_dir={folder}/run"
 EVAL = "eval --env.type=metaworld_mt --env.task=reach-v3 --eval.n_episodes=1 --output_dir={folder}/eval --policy.path="
 
 
@@ -46,6 +47,12 @@ def odd_repositories(hub: Hub) -> None:
         ("collect --repo_id=else/x --root={folder}/x --push_to_hub=true", "write-user", "belongs to else"),
         (f"{ENCODE}user/wm --push_to_hub=true", "read-user", "may only read"),
         ("publish --policy.path={folder} --repo_id=user/x", "", "pushing to user/x needs a token"),
+        # What is there would be lost.
+        (
+            f"{GO_ON} --dataset.repo_id=user/demos",
+            "write-user",
+            "user/wm is where the policy of --policy.path is published",
+        ),
     ],
 )
 def test_one_line(command: str, token: str, said: str, machine: Machine, tmp_path: Path) -> None:

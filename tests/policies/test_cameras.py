@@ -109,3 +109,13 @@ def test_what_is_shown_is_checked_camera_by_camera() -> None:
         check_observation(config, {LEFT: left})
     with pytest.raises(ValueError, match=r"right'; the observation has observation\.images\.left\."):
         camera_images(config, {LEFT: left[:, None], f"{LEFT}_is_pad": left})
+
+
+@pytest.mark.parametrize("scale", [torch.uint8, torch.float32])
+def test_bytes_of_a_camera_are_refused(scale: torch.dtype) -> None:
+    """Resizing would wrap them round; the policy would act on noise."""
+    config = make_config()
+    config.validate_features()
+    shown = {LEFT: torch.ones(1, 3, 64, 64), RIGHT: torch.full((1, 3, 48, 96), 200).to(scale)}
+    with pytest.raises(ValueError, match=rf"right' is {scale} up to 200; expected .* \[0, 1\]: divide"):
+        check_observation(config, shown)

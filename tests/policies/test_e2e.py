@@ -212,6 +212,13 @@ def test_unknown_task_names_the_known_ones() -> None:
         policy.select_action({key: value for key, value in seen(1).items() if key != "task"})
 
 
+def test_one_string_is_the_task_of_all_frames() -> None:
+    policy = make_policy("e2e_bc").eval()
+    frames = seen(2)
+    every = policy.select_action({**frames, "task": ["Push", "Push"]})
+    assert torch.equal(policy.select_action({**frames, "task": "Push"}), every)
+
+
 def test_one_known_task_needs_no_string() -> None:
     policy = make_policy("e2e_bc", tasks=["Reach"]).eval()
     frames = seen(2)

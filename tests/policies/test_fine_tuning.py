@@ -10,6 +10,7 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.io_utils import load_stats, write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.factory import get_policy_class, make_policy_config
@@ -443,6 +444,36 @@ def test_iql_goes_on_with_a_renamed_state(
         f'--rename_map={{"observation.joints":"observation.state"}} --output_dir={tmp_path / "run"}',
     )
     assert load(tmp_path / "run" / CHECKPOINT).config.tasks == ["Reach", "Push", "Wave"]
+
+
+def test_actions_that_it_cannot_command_are_told(
+    known: LeRobotDataset, checkpoints: dict[str, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = tmp_path / "wider"
+    shutil.copytree(known.root, root)
+    stats = load_stats(root)
+    stats["action"]["max"][1] = 7
+    write_stats(stats, root)
+    for dataset, said in (
+        (known, []),
+        (LeRobotDataset("test/wider", root=root), ["Number 1 of the actions"]),
+    ):
+        caplog.clear()
+        go_on(checkpoints["e2e_bc"], dataset)
+        told = [record.message for record in caplog.records if "cannot command" in record.message]
+        assert [message[: len("Number 1 of the actions")] for message in told] == said
+    assert "to 7 in test/wider" in told[0]
+
+
+def test_a_revision_of_the_checkpoint_before_is_not_handed_on(
+    checkpoints: dict[str, Path], tmp_path: Path
+) -> None:
+    """LeRobot would ask the new policy's repository for it."""
+    policy = load(checkpoints["wm_bc"])
+    policy.config.pretrained_revision = "v1"
+    policy.save_pretrained(tmp_path)
+    assert policy.config.pretrained_revision == "v1"
+    assert load(tmp_path).config.pretrained_revision is None
 
 
 RENAMED = {

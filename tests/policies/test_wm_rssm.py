@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets.io_utils import load_stats, write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file, save_file
 
@@ -58,6 +59,22 @@ def test_plain_lerobot_train_takes_the_same_flags(
     stats, scaling = demos.meta.stats["observation.image"], policy.world_model.image_scaling
     np.testing.assert_allclose(scaling.offset, stats["mean"].flatten(), rtol=1e-6)
     np.testing.assert_allclose(scaling.scale, stats["std"].flatten(), rtol=1e-6)
+
+
+def test_images_without_statistics_are_not_scaled(
+    demos: LeRobotDataset, demos_root: Path, tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    """LeRobot's own `recompute_stats` leaves images out."""
+    root = tmp_path / "dataset"
+    shutil.copytree(demos_root, root)
+    stats = load_stats(root)
+    del stats["observation.image"]
+    write_stats(stats, root)
+    flags = f"{SHORT} {TRAIN_FLAGS} {DATASET_FLAGS.format(root=root)} --dataset.use_imagenet_stats=false"
+    lerobot_wm_command(f"train {flags} --output_dir={tmp_path / 'run'}")
+    flags += f" --output_dir={tmp_path / 'scaled'}"
+    with pytest.raises(ValueError, match=r"'mean' of 'observation\.image'.*leave out .*standardize_images"):
+        lerobot_wm_command(f"train {flags} --policy.rssm.standardize_images=true")
 
 
 def test_held_out_loss(
