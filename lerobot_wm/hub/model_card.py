@@ -31,6 +31,8 @@ class TrainingData:
     Attributes:
         repo_id: Its name.
         episodes, frames: How many.
+        fps: Frames a second.
+        robot_type: What it was recorded on, as LeRobot names it; None where it does not say.
         tasks: Its task strings.
         fingerprint: `dataset_fingerprint` of it.
         latents: Their record, where it holds latents.
@@ -39,6 +41,8 @@ class TrainingData:
     repo_id: str
     episodes: int
     frames: int
+    fps: int
+    robot_type: str | None
     tasks: list[str]
     fingerprint: str
     latents: LatentRecord | None
@@ -51,6 +55,8 @@ class TrainingData:
             repo_id=meta.repo_id,
             episodes=meta.total_episodes,
             frames=meta.total_frames,
+            fps=meta.fps,
+            robot_type=meta.robot_type,
             tasks=[str(task) for task in meta.tasks.index],
             fingerprint=dataset_fingerprint(root),
             latents=LatentRecord.read(root) if OBS_LATENT in meta.features else None,

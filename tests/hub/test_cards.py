@@ -59,7 +59,7 @@ def test_no_name_breaks_a_card() -> None:
     config.input_features = features("VISUAL", "observation.image", (3, 64, 64))
     config.output_features = features("ACTION", "action", (4,))
     run = TrainPipelineConfig(dataset=DatasetConfig(repo_id="user/x"), policy=config)
-    data = TrainingData("user/x", 2, 100, NASTY, "0123456789abcdef", None)
+    data = TrainingData("user/x", 2, 100, 30, NASTY[0], NASTY, "0123456789abcdef", None)
     policy_class = get_policy_class("wm_rssm")
     card = model_card(
         *(policy_class, config, "user/wm", run, data),

@@ -100,6 +100,7 @@ def test_a_trained_policy_arrives_to_the_byte_and_its_card_works(
         assert read(hub, "model", repo_id, name) == (checkpoint / name).read_bytes()
     card = ModelCard(read(hub, "model", repo_id, "README.md").decode())
     assert card.data.datasets == ["user/demos"]
+    assert "| frames a second, robot | 80, `metaworld` |" in card.text
     [example] = PYTHON_BLOCK.findall(card.text)
     made = "states.latent" if repo_id == "user/wm" else "action"
     result = machine.python(
