@@ -1,9 +1,11 @@
 """Paired comparison of two arms over the rollouts that both made."""
 
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import binomtest
+from scipy.stats import t as student_t
 
 from lerobot_wm.report.arms import COMPARED_ARMS, SHARING_WORLD_MODEL, by_arm
 from lerobot_wm.report.bootstrap import RNG_SEED, percentile_interval, resample
@@ -16,7 +18,8 @@ SIGNIFICANCE = 0.05  # McNemar's test below which arms are called different, whe
 class Comparison:
     """Success of `arm` minus that of `other`, in percentage points, over `n_pairs` rollouts of each.
 
-    `only_arm` and `only_other` count the pairs where just that one succeeded. `p_value` is that of the exact
+    `interval` covers the choice of variations, `training_interval` that of trainings; the latter is None where an arm
+    has one. `only_arm` and `only_other` count the pairs where just that one succeeded. `p_value` is that of the exact
     McNemar test, None where several trainings of an arm make the pairs of a variation dependent.
     """
 
@@ -25,6 +28,7 @@ class Comparison:
     n_pairs: int
     difference: float
     interval: tuple[float, float]
+    training_interval: tuple[float, float] | None
     only_arm: int
     only_other: int
     p_value: float | None
@@ -35,10 +39,12 @@ class Comparison:
 
         The bootstrap is too sure of itself where few pairs differ: four won and none lost exclude zero at p 0.125.
         """
-        low, high = self.interval
-        if low <= 0 <= high or (self.p_value is not None and self.p_value >= SIGNIFICANCE):
+        intervals = [self.interval, *([self.training_interval] if self.training_interval else [])]
+        zero_in = any(low <= 0 <= high for low, high in intervals)
+        if zero_in or (self.p_value is not None and self.p_value >= SIGNIFICANCE):
             return "no difference shown"
-        return f"{'better' if low > 0 else 'worse'} (interval excludes zero)"
+        excludes = "intervals exclude" if len(intervals) > 1 else "interval excludes"
+        return f"{'better' if self.difference > 0 else 'worse'} ({excludes} zero)"
 
 
 def compare(records: list[Record], others: list[Record]) -> Comparison | None:
@@ -50,8 +56,9 @@ def compare(records: list[Record], others: list[Record]) -> Comparison | None:
 
     The difference is averaged over the pairs of a variation, the variations of a task and then the tasks. The interval
     is a percentile bootstrap that resamples variations within each task: a variation is drawn with all of its pairs,
-    since rollouts on one variation are not independent. It covers the choice of variations; the trainings are taken as
-    they are.
+    since rollouts on one variation are not independent. It covers the choice of variations. That of trainings is
+    covered by a t interval over the trainings' success on these variations: Welch's of two samples, or of the
+    differences between arms on a shared world model.
     """
     arm, other = records[0]["arm"], others[0]["arm"]
     seed_by_seed = {arm, other} <= SHARING_WORLD_MODEL
@@ -84,6 +91,11 @@ def compare(records: list[Record], others: list[Record]) -> Comparison | None:
         n_pairs=len(flat),
         difference=100 * float(np.mean(differences)),
         interval=percentile_interval(100 * np.mean(draws, axis=0)),
+        training_interval=_over_trainings(
+            _rates(ours, {seed for seed, _ in trainings}, theirs),
+            _rates(theirs, {seed for _, seed in trainings}, ours),
+            seed_by_seed,
+        ),
         only_arm=only_arm,
         only_other=only_other,
         p_value=_mcnemar(only_arm, only_other) if len(trainings) == 1 else None,
@@ -108,6 +120,41 @@ def _by_variation(records: list[Record]) -> dict[tuple[str, int], dict[int | Non
     for record in records:
         found.setdefault((record["task"], record["variation"]), {})[record["seed"]] = record["success"]
     return found
+
+
+def _rates(
+    found: dict[tuple[str, int], dict[int | None, bool]],
+    seeds: set[int | None],
+    shared: Container[tuple[str, int]],
+) -> list[float]:
+    """Success of each training in per cent, in the order of seeds: of the shared variations, averaged over tasks."""
+    rates = []
+    for seed in sorted(seeds, key=str):
+        of_task: dict[str, list[bool]] = {}
+        for (task, variation), successes in found.items():
+            if (task, variation) in shared and seed in successes:
+                of_task.setdefault(task, []).append(successes[seed])
+        rates.append(100 * float(np.mean([np.mean(successes) for successes in of_task.values()])))
+    return rates
+
+
+def _over_trainings(ours: list[float], theirs: list[float], paired: bool) -> tuple[float, float] | None:
+    """95% t interval of the difference between trainings' means; None where an arm has one training.
+
+    Welch's for two samples. SciPy's own warns where trainings of an arm succeed alike, which here is nothing unusual.
+    """
+    if min(len(ours), len(theirs)) < 2:
+        return None
+    samples = [np.subtract(ours, theirs)] if paired else [np.asarray(ours), np.asarray(theirs)]
+    squared_errors = np.array([np.var(sample, ddof=1) / len(sample) for sample in samples])
+    degrees = np.array([len(sample) - 1 for sample in samples])
+    difference = float(np.mean(ours) - np.mean(theirs))
+    total = squared_errors.sum()
+    if np.isclose(total, 0):
+        return difference, difference
+    freedom = total**2 / (squared_errors**2 / degrees).sum()
+    half = float(student_t.ppf(0.975, freedom) * np.sqrt(total))
+    return difference - half, difference + half
 
 
 def _mcnemar(only_arm: int, only_other: int) -> float:

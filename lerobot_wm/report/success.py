@@ -20,8 +20,9 @@ PAIRED = (
     "Percentage points over the variations that both arms were rolled out on; each training of the one is paired with "
     "each of the other, but for arms on a shared world model, which are paired by training seed. [95% bootstrap "
     "interval]: variations are resampled within each task, each with all its pairs; it covers the choice of "
-    "variations, not of trainings. won–lost: pairs in which only the one, only the other succeeded. p: exact McNemar "
-    "test where both have one training, not corrected for the number of comparisons."
+    "variations. Over trainings: 95% t interval of the difference between trainings on these variations (Welch; by "
+    "seed on a shared world model), where both arms have several. won–lost: pairs in which only the one, only the "
+    "other succeeded. p: exact McNemar test where both have one training. Not corrected for the number of comparisons."
 )
 
 
@@ -92,13 +93,14 @@ def comparison_tables(records: list[Record]) -> list[ReportTable]:
 def _comparison_table(comparisons: list[Comparison]) -> ReportTable:
     rows: list[tuple[str, list[Cell]]] = []
     for c in comparisons:
-        low, high = c.interval
-        difference = f"{c.difference:+.1f} [{low:+.1f}, {high:+.1f}]"
+        difference = f"{c.difference:+.1f} {_interval_text(c.interval)}"
+        over_trainings = "–" if c.training_interval is None else _interval_text(c.training_interval)
+        won_lost = f"{c.only_arm}–{c.only_other}"
         rows.append(
-            (c.other, [difference, f"{c.only_arm}–{c.only_other}", _p_text(c.p_value), c.n_pairs, c.verdict])
+            (c.other, [difference, over_trainings, won_lost, _p_text(c.p_value), c.n_pairs, c.verdict])
         )
     title = f"{comparisons[0].arm} against each other arm"
-    columns = ["difference", "won–lost", "p", "pairs", comparisons[0].arm + " is"]
+    columns = ["difference", "over trainings", "won–lost", "p", "pairs", comparisons[0].arm + " is"]
     return ReportTable(title, "against", columns, rows)
 
 
@@ -136,6 +138,11 @@ def _training_notes(arms: list[str]) -> list[str]:
     if any("iql" in arm for arm in arms):
         notes.append(IQL_NOTE)
     return notes
+
+
+def _interval_text(interval: tuple[float, float]) -> str:
+    low, high = interval
+    return f"[{low:+.1f}, {high:+.1f}]"
 
 
 def _p_text(p_value: float | None) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_1samp, ttest_ind
 
 from lerobot_wm.experiment.arms import ARMS as EXPERIMENT_ARMS
 from lerobot_wm.experiment.arms import WM_RSSM
@@ -66,6 +67,38 @@ def test_seeds_of_one_variation_are_not_independent(make_records: Callable) -> N
     assert several.n_pairs == 5 * 5 * one.n_pairs
     assert several.interval == pytest.approx(one.interval)
     assert several.p_value is None
+
+
+def runs(arm: str, successes: list[int]) -> list[Record]:
+    """Trainings with so many successes on 40 variations of one task."""
+    return [
+        {"arm": arm, "seed": seed, "task": "reach-v3", "variation": k, "success": k < n}
+        for seed, n in enumerate(successes)
+        for k in range(40)
+    ]
+
+
+def test_trainings_that_differ_are_told_apart_by_their_spread() -> None:
+    """Two lucky trainings of three win on almost all variations and show nothing of the next training."""
+    ours, theirs = [30, 30, 10], [16, 17, 18]
+    found = compare(runs("wm_bc", ours), runs("e2e_bc", theirs))
+    assert found.interval[0] > 0
+    t = ttest_ind([n / 0.4 for n in ours], [n / 0.4 for n in theirs], equal_var=False)
+    assert found.training_interval == pytest.approx(tuple(t.confidence_interval()))
+    assert found.training_interval[0] < 0
+    assert found.verdict == "no difference shown"
+    steady = compare(runs("wm_bc", [30, 29, 31]), runs("e2e_bc", theirs))
+    assert steady.training_interval[0] > 0
+    assert steady.verdict == "better (intervals exclude zero)"
+    assert compare(runs("e2e_bc", theirs), runs("wm_bc", [30, 29, 31])).verdict.startswith("worse")
+    assert compare(runs("wm_bc", ours), runs("e2e_bc", [17])).training_interval is None
+
+
+def test_trainings_on_a_shared_world_model_differ_together() -> None:
+    """A world model that is good for both arms adds nothing to the spread of their difference."""
+    shared = compare(runs("wm_bc", [10, 20, 31]), runs("wm_iql", [8, 18, 28]))
+    assert shared.training_interval == pytest.approx(tuple(ttest_1samp([5, 5, 7.5], 0).confidence_interval()))
+    assert compare(runs("wm_bc", [10, 20, 30]), runs("wm_iql", [8, 18, 28])).training_interval == (5, 5)
 
 
 def test_only_shared_rollouts_count(make_records: Callable) -> None:

@@ -110,12 +110,13 @@ def test_comparison_in_words(make_records: Callable) -> None:
     [(other, cells)] = table.rows
     assert other == "proprio_bc"
     assert cells[0].startswith("+16.0 [+")
-    assert cells[1:] == ["8–0", "0.008", 50, "better (interval excludes zero)"]
+    assert cells[1:] == ["–", "8–0", "0.008", 50, "better (interval excludes zero)"]
     assert comparison_tables(make_records("proprio_bc", TASKS)) == []
 
 
 def test_comparisons_over_seeds_have_no_p(make_records: Callable) -> None:
     records = [r for arm in ("wm_iql", "wm_bc") for seed in (0, 1) for r in make_records(arm, TASKS, seed)]
     tables = comparison_tables(records)
-    assert [table.rows[0][1][2] for table in tables] == ["–", "–"]
+    assert [table.rows[0][1][1] for table in tables] == ["[+0.0, +0.0]"] * 2
+    assert [table.rows[0][1][3] for table in tables] == ["–", "–"]
     assert [len(table.notes) for table in tables] == [0, 1], "explained once"
