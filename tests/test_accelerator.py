@@ -50,6 +50,18 @@ def test_a_step_is_the_optimizers_own(accelerator: RamAccelerator, monkeypatch: 
         assert model.slope.grad is None
 
 
+def test_a_step_walks_through_no_modules(
+    accelerator: RamAccelerator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot asks for the parameters at every step, those of a frozen world model among them."""
+    model = nn.Sequential(Line(), Line())
+    expected = list(model.parameters())
+    prepared = accelerator.prepare(model)
+    monkeypatch.setattr(nn.Module, "named_modules", lambda *_, **__: pytest.fail("a walk"))
+    for _ in range(2):
+        assert [id(each) for each in prepared.parameters()] == [id(each) for each in expected]
+
+
 def test_unwrapping_gives_what_accelerate_gives(accelerator: RamAccelerator) -> None:
     prepared = accelerator.prepare(Line())
     assert accelerator.unwrap_model(prepared) is Accelerator.unwrap_model(accelerator, prepared)

@@ -51,6 +51,11 @@ class RamAccelerator(Accelerator):
             check_environment_fits(cfg.policy, cfg.env, cfg.rename_map)
         prepared = super().prepare_model(model, *args, **kwargs)
         self._watch.attach(prepared)
+        if self.distributed_type == DistributedType.NO:  # nothing exchanges them once training runs
+            # LeRobot asks for them at every step, and a walk through a frozen world model takes longer than what
+            # it does with a small policy's gradients.
+            parameters = list(prepared.parameters())
+            prepared.parameters = lambda: iter(parameters)
         return prepared
 
     def prepare_optimizer(self, optimizer: Optimizer, device_placement: bool | None = None) -> Any:
