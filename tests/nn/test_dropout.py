@@ -44,6 +44,13 @@ def test_seeded_and_off_when_evaluated() -> None:
     assert layer.train()(x[:0]).shape == (0, 3)
 
 
+@pytest.mark.parametrize(("p", "kept"), [(1e-7, 5000), (1 - 1e-7, 0)])
+def test_probability_finer_than_its_levels(p: float, kept: int) -> None:
+    """To the nearest level these are 0 and 1: the latter ended in a division by zero."""
+    torch.manual_seed(0)
+    assert Dropout(p)(torch.ones(5000)).count_nonzero() == kept
+
+
 @pytest.mark.parametrize("p", [-0.1, 1.0])
 def test_impossible_probability_is_refused(p: float) -> None:
     with pytest.raises(ValueError, match="expected a probability"):
