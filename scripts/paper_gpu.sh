@@ -4,6 +4,7 @@
 #
 #   scripts/paper_gpu.sh          the preset `paper`
 #   scripts/paper_gpu.sh smoke    the same path in minutes on two CPU cores
+#   LIMIT=540 scripts/paper_gpu.sh    stops after so many seconds, and keeps what there is by then
 #
 # The work goes to outputs/<preset>, what is worth keeping to $OUT (outputs/paper_gpu/<preset> by default). Called again
 # it goes on where it stopped. PYTHON names an interpreter that has the project installed, to use in place of .venv.
@@ -26,11 +27,19 @@ mkdir -p "$OUT"
 
 # Records that were committed do not count here: the machine is to do the work.
 status=0
-"$PYTHON" scripts/reproduce_table1.py --preset="$PRESET" --arms=wm_bc,wm_iql --seeds=0 --results_dir="$OUT/none" || status=$?
+${LIMIT:+timeout "$LIMIT"} "$PYTHON" scripts/reproduce_table1.py --preset="$PRESET" --arms=wm_bc,wm_iql --seeds=0 \
+  --results_dir="$OUT/none" || status=$?
 
-for file in records.jsonl times.json report/index.html report/success.md report/open_loop.png; do
+# Stopped before its end, it has its own records and the logs of its trainings alone.
+for file in own_records.jsonl records.jsonl times.json report/index.html report/success.md report/open_loop.png; do
   if [[ -e "outputs/$PRESET/$file" ]]; then
     cp "outputs/$PRESET/$file" "$OUT/"
+  fi
+done
+for training in wm_rssm wm_bc wm_iql; do
+  log="outputs/$PRESET/seed_0/$training/train_log.jsonl"
+  if [[ -e "$log" ]]; then
+    cp "$log" "$OUT/$training.jsonl"
   fi
 done
 "$PYTHON" - "$PRESET" "$SECONDS" "$OUT/provenance.json" <<'END'

@@ -50,6 +50,20 @@ def test_a_step_is_the_optimizers_own(accelerator: RamAccelerator, monkeypatch: 
         assert model.slope.grad is None
 
 
+def test_the_gpu_is_the_one_that_was_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Accelerate takes the current one, and evaluation the one that was named."""
+    chosen = []
+    policy = E2EBCConfig(device="cpu", dtype="float32", push_to_hub=False)
+    cfg = TrainPipelineConfig(DatasetConfig("test/demos"), policy=policy, output_dir=tmp_path)
+    monkeypatch.setattr(torch.cuda, "set_device", chosen.append)
+    for device in ("cuda:1", "cuda", "cpu"):
+        policy.device = device
+        AcceleratorState._reset_state(reset_partial_state=True)
+        make_accelerator(cfg)
+    AcceleratorState._reset_state(reset_partial_state=True)
+    assert chosen == [torch.device("cuda:1")]
+
+
 def test_a_step_walks_through_no_modules(
     accelerator: RamAccelerator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,5 +1,6 @@
 """Batches equal to LeRobot's DataLoader, gathered from RAM or GPU memory; images at the size a policy takes."""
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,8 @@ from lerobot_wm.data.cache import camera_frames, check_colours
 from lerobot_wm.data.check_info import TEXT_DTYPES
 from lerobot_wm.data.finite import check_finite_columns
 from lerobot_wm.data.tables import column_tensor
+
+logger = logging.getLogger(__name__)
 
 _COPIED_AT_ONCE = 1024  # frames
 _GPU_SHARE = 0.6  # of the free GPU memory may be taken by resident frames; activations need the rest
@@ -51,7 +54,8 @@ class RamDataset:
         meta = dataset.meta
         check_colours(dataset, meta.camera_keys if cameras is None else cameras)
         self._tasks = [str(task) for task in meta.tasks.index]
-        self._deltas: dict[str, list[int]] = dataset.reader.delta_indices or {}
+        self._deltas = {key: tuple(deltas) for key, deltas in (dataset.reader.delta_indices or {}).items()}
+        self._offsets = {deltas: torch.tensor(deltas, device=device) for deltas in self._deltas.values()}
         kinds = {key: feature["dtype"] for key, feature in meta.features.items()}
         self._columns = {
             key: column_tensor(dataset.hf_dataset, key, tuple(meta.features[key]["shape"])).to(device)
@@ -65,6 +69,9 @@ class RamDataset:
             if kind == "string"
         }
         check_finite_columns(self._columns, self._tasks, dataset.repo_id)
+        self._task_of_row: list[int] = self._columns[
+            "task_index"
+        ].tolist()  # a GPU's would be waited for at each batch
         # PNG frames leave LeRobot's loader as float32, video frames as uint8 for the training loop to convert.
         self._float_cameras = set(meta.image_keys)
         self._cameras = {
@@ -76,8 +83,7 @@ class RamDataset:
             "index"
         ]  # (N,), which is no row's number where episodes were chosen
         if self._fit_on_device():
-            self._cameras = {key: self._on_device(frames) for key, frames in self._cameras.items()}
-            self._frame_of_row = torch.arange(len(self._frame_of_row), device=device)
+            self._move_frames()
 
         episode = self._columns["episode_index"]
         starts = torch.searchsorted(episode, episode)  # rows of an episode are consecutive
@@ -92,7 +98,7 @@ class RamDataset:
         for key in (*self._columns, *self._cameras):
             window, is_pad = index, None
             if key in self._deltas:
-                deltas = tuple(self._deltas[key])
+                deltas = self._deltas[key]
                 if deltas not in windows:
                     windows[deltas] = self._window(index, deltas)
                 window, is_pad = windows[deltas]
@@ -103,12 +109,12 @@ class RamDataset:
             )
         for key, texts in self._texts.items():
             out[key] = [texts[row] for row in rows]
-        out["task"] = [self._tasks[i] for i in out["task_index"].tolist()]
+        out["task"] = [self._tasks[self._task_of_row[row]] for row in rows]
         return out
 
     def _window(self, index: Tensor, deltas: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """Rows (B, T) around each index, clamped to its episode, and where they were clamped (B, T)."""
-        wanted = index[:, None] + torch.tensor(deltas, device=self.device)
+        wanted = index[:, None] + self._offsets[deltas]
         clamped = wanted.clamp(self._first[index][:, None], self._last[index][:, None])
         return clamped, wanted != clamped
 
@@ -125,6 +131,18 @@ class RamDataset:
         free, _ = torch.cuda.mem_get_info(self.device)
         n_bytes = sum(len(self._frame_of_row) * frames[0].numel() for frames in self._cameras.values())
         return n_bytes < _GPU_SHARE * free
+
+    def _move_frames(self) -> None:
+        """Keep the frames on the device, unless others have taken its memory since there was room."""
+        try:
+            self._cameras = {key: self._on_device(frames) for key, frames in self._cameras.items()}
+        except torch.OutOfMemoryError:
+            logger.warning(
+                "The GPU's memory was taken meanwhile: frames are served from RAM, which is slower."
+            )
+            torch.cuda.empty_cache()
+            return
+        self._frame_of_row = torch.arange(len(self._frame_of_row), device=self.device)
 
     def _on_device(self, frames: Tensor) -> Tensor:
         """The frames of this dataset's own episodes in the device's memory, (N, H, W, C) uint8 by row."""

@@ -137,8 +137,11 @@ def make_accelerator(cfg: TrainPipelineConfig) -> RamAccelerator:
         RuntimeError: Several processes were asked for, and accelerate started one.
     """
     policy = cfg.policy
+    device = torch.device(policy.device)
+    if device.type == "cuda" and device.index is not None and "LOCAL_RANK" not in os.environ:
+        torch.cuda.set_device(device)  # where accelerate was not told by a launcher it takes the current one
     # As in LeRobot: a policy's own `dtype` decides the precision; where it has none `use_amp`, or the launcher.
-    amp_dtype = torch.get_autocast_dtype(torch.device(policy.device).type) if policy.use_amp else None
+    amp_dtype = torch.get_autocast_dtype(device.type) if policy.use_amp else None
     dtype = str(getattr(policy, "dtype", amp_dtype)).removeprefix("torch.")
     accelerator = RamAccelerator(
         cfg,

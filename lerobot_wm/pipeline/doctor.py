@@ -173,8 +173,8 @@ def check_gpu() -> Check:
     """The GPU that PyTorch can use, if any."""
     if torch.cuda.is_available():
         gpu = torch.cuda.get_device_properties(0)
-        count, bf16 = torch.cuda.device_count(), "yes" if torch.cuda.is_bf16_supported() else "no"
-        found = f"{count} x {gpu.name}, {gpu.total_memory / 1e9:.0f} GB, bfloat16: {bf16}"
+        bf16 = "yes" if torch.cuda.is_bf16_supported(including_emulation=False) else "no"
+        found = f"{torch.cuda.device_count()} x {gpu.name}, {gpu.total_memory / 1e9:.0f} GB, bfloat16: {bf16}"
         return Check("GPU", found, needed=False)
     if shutil.which("nvidia-smi"):
         how = f"update the NVIDIA driver to one for CUDA {torch.version.cuda}, or install another torch build"

@@ -33,8 +33,6 @@ class TaskRunner:
     def __init__(self, cfg: EvaluateConfig) -> None:
         self.cfg = cfg
         self.device = get_safe_torch_device(cfg.policy.device)
-        torch.backends.cudnn.benchmark = True
-        torch.backends.cuda.matmul.allow_tf32 = True
         self.training_seed = training_seed(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
         # One vector environment per batch size: a shorter last batch must not run further seeds.
         sizes = {len(seeds) for seeds in self._batches()}

@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
 from lerobot_wm.constants import OBS_STATE
@@ -25,6 +26,10 @@ class E2EPolicy(MultiTaskPolicy):
         dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
+        if dataset_stats is not None and dataset_meta is not None:
+            # Made new: settings of a finished training hold the sizes of that one's cameras.
+            found = dataset_to_policy_features(dataset_meta.features)
+            config.input_features |= {key: found[key] for key in config.input_features.keys() & found.keys()}
         super().__init__(config, dataset_stats, dataset_meta)
         config.input_features = {key: config.input_features[key] for key in (*config.cameras, OBS_STATE)}
         self.encoder = ImageEncoder(config.encoder, config.image_shape)

@@ -11,7 +11,7 @@ from lerobot_wm.constants import ACTION, OBS_STATE, TASK
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.policies.action_noise import ActionNoise
-from lerobot_wm.policies.features import stat
+from lerobot_wm.policies.features import check_has_stats, stat
 from lerobot_wm.policies.multi_task_config import MultiTaskConfig
 from lerobot_wm.policies.pretrained import StrictPolicy
 
@@ -35,6 +35,7 @@ class MultiTaskPolicy(StrictPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config)
+        check_has_stats(dataset_meta)
         # Made new, not loaded from a checkpoint: its settings may be those of another policy, tasks and all.
         if dataset_meta is not None and (dataset_stats is not None or not config.tasks):
             config.tasks = [str(task) for task in dataset_meta.tasks.index]
@@ -69,7 +70,10 @@ class MultiTaskPolicy(StrictPolicy):
         """Warn of a dataset whose actions lie where this policy's, scaled as in its first training, cannot go."""
         stats = dataset_meta.stats or {}
         low, high = stat(stats, ACTION, "min"), stat(stats, ACTION, "max")  # (A,)
-        lowest, highest = (self.action_scaling.inverse(torch.full_like(low, end)) for end in (-1.0, 1.0))
+        ends = (torch.full_like(self.action_scaling.offset, end) for end in (-1.0, 1.0))
+        lowest, highest = (
+            self.action_scaling.inverse(end).cpu() for end in ends
+        )  # (A,), like the statistics
         slack = _SLACK * (high - low)
         for i in torch.nonzero((low < lowest - slack) | (high > highest + slack)).flatten().tolist():
             logger.warning(

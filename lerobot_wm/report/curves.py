@@ -11,7 +11,16 @@ from lerobot_wm.constants import TRAIN_LOG_NAME
 from lerobot_wm.report.inline import short
 
 # LeRobot's counters and timings, which say nothing about learning.
-BOOKKEEPING = {"steps", "samples", "episodes", "epochs", "update_s", "dataloading_s", "samples_per_s"}
+BOOKKEEPING = {
+    "steps",
+    "samples",
+    "episodes",
+    "epochs",
+    "update_s",
+    "dataloading_s",
+    "samples_per_s",
+    "gpu_mem_gb",
+}
 # One run as {name: [(step, value), ...]}.
 Curves = dict[str, list[tuple[int, float]]]
 COLOURS = colormaps["tab20"].colors  # type: ignore[attr-defined]  # a ListedColormap

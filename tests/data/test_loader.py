@@ -77,6 +77,21 @@ def test_frames_that_lie_on_the_device_are_those_of_the_datasets_own_episodes(
         assert frames.dtype == torch.uint8
 
 
+def test_frames_for_which_the_device_has_no_room_after_all_are_served_from_ram(
+    demos_root: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Trainings that start together on one GPU all see the same free memory."""
+
+    def full(self: RamDataset, frames: torch.Tensor) -> torch.Tensor:
+        raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr(RamDataset, "_fit_on_device", lambda self: True)
+    monkeypatch.setattr(RamDataset, "_on_device", full)
+    dataset = LeRobotDataset("test/demos", root=demos_root, delta_timestamps=windows(3), return_uint8=True)
+    assert_equal_batches(dataset, some_indices(dataset))
+    assert "frames are served from RAM" in caplog.text
+
+
 def test_past_frames_and_uneven_deltas_equal_lerobots(demos_root: Path) -> None:
     deltas = {"observation.state": [-2 / 80, 0.0], "action": [0.0, 3 / 80]}
     dataset = LeRobotDataset("test/demos", root=demos_root, delta_timestamps=deltas, return_uint8=True)

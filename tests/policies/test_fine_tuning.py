@@ -16,6 +16,7 @@ from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file
 from torch import nn
+from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTensorMode
 
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.pipeline.encode import encode_to_cache
@@ -463,6 +464,31 @@ def test_actions_that_it_cannot_command_are_told(
         told = [record.message for record in caplog.records if "cannot command" in record.message]
         assert [message[: len("Number 1 of the actions")] for message in told] == said
     assert "to 7 in test/wider" in told[0]
+
+
+def test_actions_are_compared_where_the_statistics_are(
+    known: LeRobotDataset, checkpoints: dict[str, Path]
+) -> None:
+    """The policy may be on a GPU. Tensors that only know their device and shape tell without one."""
+    policy = load(checkpoints["e2e_bc"])
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        for name, values in list(policy.action_scaling.named_buffers()):
+            setattr(policy.action_scaling, name, torch.empty(values.shape, device="cuda"))
+        with pytest.raises(DynamicOutputShapeException):  # where the numbers would decide
+            policy.tell_of_actions_out_of_range(known.meta)
+
+
+def test_a_new_training_with_the_settings_of_a_finished_one_sees_its_own_cameras(
+    known: LeRobotDataset, checkpoints: dict[str, Path], tmp_path: Path
+) -> None:
+    features = dict(known.meta.features)
+    features = {**features, FRONT: camera(40, 50)}
+    larger = record(tmp_path / "larger", features, [("Push", 6)])
+    config = PreTrainedConfig.from_pretrained(checkpoints["e2e_bc"])
+    size = config.encoder_image_size
+    policy = make_policy(config, ds_meta=larger.meta)
+    assert policy.config.input_features[FRONT].shape == (3, 40, 50)
+    assert policy.config.encoder_image_size == size
 
 
 def test_a_revision_of_the_checkpoint_before_is_not_handed_on(
