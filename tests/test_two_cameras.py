@@ -11,6 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader
 
 from lerobot_wm.data.loader import RamLoader
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.report.open_loop import CONTEXT, load_world_model, open_loop, strips_figure
 from tests.flags import TRAIN_FLAGS
@@ -165,7 +166,9 @@ def test_latents_of_other_cameras_never_mix(
 
 
 def test_open_loop_strips_show_both_cameras(dataset: LeRobotDataset, world_model_path: Path) -> None:
-    results = open_loop(load_world_model(str(world_model_path)), "test/two", str(dataset.root))
+    results = open_loop(
+        load_world_model(str(world_model_path)), dataset.meta, SourceConfig("test/two", str(dataset.root))
+    )
     assert results[0].imagined.shape[1:] == (3, 64, 128)
     start = dataset.meta.episodes[0]["dataset_from_index"]
     both = torch.cat([dataset[start + CONTEXT - 1][key] for key in CAMERAS], dim=-1)

@@ -7,9 +7,8 @@ import draccus
 from lerobot.configs.default import WandBConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.data.check import check_dataset
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.pipeline.quiet import quiet, silence
-from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.pipeline.wandb_log import log_dream, wandb_run
 from lerobot_wm.policies.checkpoint import split_revision
 from lerobot_wm.report.dream import Dreams, dream
@@ -58,14 +57,10 @@ def dream_of(cfg: DreamConfig) -> Dreams:
             size, or there is no such episode, or it is too short.
     """
     policy = load_world_model(cfg.policy.path)
-    check_dataset(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     with quiet():
-        meta = LeRobotDatasetMetadata(
-            cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision
-        )
+        meta = cfg.dataset.metadata()
         check_features(policy, meta)
-        root, revision = cfg.dataset.root, cfg.dataset.revision
-        [episode] = read_episodes(policy, meta, root, [cfg.episode], _frames_read(cfg, meta), revision)
+        [episode] = read_episodes(policy, meta, cfg.dataset, [cfg.episode], _frames_read(cfg, meta))
     dreams = dream(policy, episode, cfg.context)
     video, strip = outputs(cfg)
     cfg.output_dir.mkdir(parents=True, exist_ok=True)

@@ -23,6 +23,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot_wm.constants import OBS_LATENT, OBS_STATE
 from lerobot_wm.data.cache import cache_root
 from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.finite import check_finite_dataset
 from lerobot_wm.data.folder import dataset_folder, is_snapshot
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.data.lock import sole_writer
@@ -199,7 +200,10 @@ def encode_to_cache(
         if output_root.is_dir():
             logger.info("Latents found in %s", output_root)
         else:
-            logger.info("Encoding %s into %s", repo_id, output_root)
+            logger.info(
+                "Encoding %s, all of its %d episodes, into %s", repo_id, meta.total_episodes, output_root
+            )
+            check_finite_dataset(source)
             encode(policy, source, f"{repo_id}_latents", output_root, rename_map=rename_map)
     return output_root
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot_wm.pipeline.source import SourceConfig
+from lerobot_wm.hub.source import SourceConfig
 
 
 @dataclass

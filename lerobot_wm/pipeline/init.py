@@ -15,7 +15,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_wm.data.lock import sole_writer
-from lerobot_wm.pipeline.source import SourceConfig
+from lerobot_wm.hub.source import SourceConfig
 
 
 @dataclass

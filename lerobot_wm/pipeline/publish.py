@@ -17,8 +17,9 @@ from lerobot_wm.data.folder import dataset_folder
 from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.hub.markdown import escaped
 from lerobot_wm.hub.model_card import IMAGINATION, TrainingData, model_card
-from lerobot_wm.pipeline.source import SourceConfig
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.world_model_config import WorldModelConfig
+from lerobot_wm.report.episodes import check_features
 from lerobot_wm.report.imagination import animation, psnr_table
 from lerobot_wm.report.open_loop import load_world_model, open_loop
 from lerobot_wm.report.records import Record, find_records, read_records
@@ -66,7 +67,8 @@ def publish(cfg: PublishConfig) -> str:
 
     Raises:
         FileNotFoundError: The folder is no checkpoint, or there are no records.
-        ValueError: The records are not of this policy, or there is no world model that could imagine.
+        ValueError: The records are not of this policy, there is no world model that could imagine, or the dataset lacks
+            what it reads.
     """
     folder = cfg.policy.path
     if not (folder / TRAIN_CONFIG_NAME).is_file():
@@ -88,8 +90,9 @@ def publish(cfg: PublishConfig) -> str:
     tasks = None
     if cfg.dataset is not None:
         policy = load_world_model(str(folder))
-        dataset = cfg.dataset.open()
-        predictions = open_loop(policy, dataset.repo_id, str(dataset.root))
+        meta = cfg.dataset.metadata()
+        check_features(policy, meta)
+        predictions = open_loop(policy, meta, cfg.dataset)
         if predictions:
             files[IMAGINATION] = animation(predictions)
             tasks = [prediction.task for prediction in predictions]

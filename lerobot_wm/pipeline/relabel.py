@@ -21,7 +21,7 @@ from lerobot_wm.constants import REWARD
 from lerobot_wm.data.fingerprint import dataset_fingerprint
 from lerobot_wm.data.lock import sole_writer
 from lerobot_wm.data.schema import RELABEL_RECORD
-from lerobot_wm.pipeline.source import SourceConfig
+from lerobot_wm.hub.source import SourceConfig
 
 
 @dataclass

@@ -1,13 +1,13 @@
 """`lerobot-wm report`: records -> success tables in the terminal and one self-contained HTML page."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from rich.console import Console
 
-from lerobot_wm.data.check import check_dataset
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.curves import curve_figures, read_logs
@@ -28,14 +28,6 @@ TERMINAL_WIDTH = 100
 
 
 @dataclass
-class ReportDatasetConfig:
-    """The dataset that the page describes, and whose episodes the world model imagines."""
-
-    repo_id: str | None = None
-    root: str | None = None
-
-
-@dataclass
 class ReportConfig:
     """Flags of `lerobot-wm report`; lists are separated by commas."""
 
@@ -49,7 +41,8 @@ class ReportConfig:
     train_logs: str | None = None
     # Checkpoint of wm_rssm, wm_bc or wm_iql whose dreams, predictions and latents of `--dataset.*` are shown.
     world_model_path: str | None = None
-    dataset: ReportDatasetConfig = field(default_factory=ReportDatasetConfig)
+    # The dataset that the page describes, and whose episodes the world model imagines.
+    dataset: SourceConfig | None = None
     # quality.json of `lerobot-wm quality`, whose section is included.
     quality: Path | None = None
 
@@ -59,7 +52,7 @@ class ReportConfig:
         Raises:
             ValueError: a world model without a dataset.
         """
-        if self.world_model_path is not None and self.dataset.repo_id is None:
+        if self.world_model_path is not None and self.dataset is None:
             raise ValueError(
                 f"--world_model_path={self.world_model_path} needs --dataset.repo_id (and --dataset.root for a local "
                 "one) as well: the image dataset whose episodes it shall imagine."
@@ -77,9 +70,8 @@ def report(cfg: ReportConfig) -> Path:
     """
     cfg.validate()
     meta = policy = None
-    if cfg.dataset.repo_id is not None:
-        check_dataset(cfg.dataset.repo_id, cfg.dataset.root)
-        meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root)
+    if cfg.dataset is not None:
+        meta = cfg.dataset.metadata()
         if cfg.world_model_path is not None:
             policy = load_world_model(cfg.world_model_path)
             check_features(policy, meta)
@@ -92,15 +84,15 @@ def report(cfg: ReportConfig) -> Path:
     page.curves = [data_uri(figure_bytes(figure, SVG), SVG) for figure in curves]
     if cfg.quality is not None:
         page.quality = quality_section(cfg.quality)
-    if meta is not None:
-        page.data = summarise_data(meta, cfg.dataset.root)
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
-    if meta is not None and policy is not None:
-        _show_world_model(page, policy, meta, cfg.dataset.root)
-        if page.open_loop:
-            picture = figure_bytes(strips_figure(page.open_loop), PNG)
-            page.strips = data_uri(picture, PNG)
-            (cfg.output_dir / "open_loop.png").write_bytes(picture)
+    if cfg.dataset is not None and meta is not None:
+        page.data = summarise_data(meta, cfg.dataset)
+        if policy is not None:
+            _show_world_model(page, policy, meta, cfg.dataset)
+    if page.open_loop:
+        picture = figure_bytes(strips_figure(page.open_loop), PNG)
+        page.strips = data_uri(picture, PNG)
+        (cfg.output_dir / "open_loop.png").write_bytes(picture)
 
     tables = [*page.tables, page.paper_table, *page.comparison_tables]
     shown = [table for table in tables if table is not None]
@@ -114,13 +106,13 @@ def report(cfg: ReportConfig) -> Path:
 
 
 def _show_world_model(
-    page: Page, policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, root: str | None
+    page: Page, policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig
 ) -> None:
     """Put on the page what a world model imagines of a dataset and knows of it."""
     page.dataset = meta.repo_id
-    page.open_loop = open_loop(policy, meta.repo_id, root)
-    page.dreams = dream_clips(policy, meta, root)
-    page.latents = latent_map(policy, meta, root)
+    page.open_loop = open_loop(policy, meta, source)
+    page.dreams = dream_clips(policy, meta, source)
+    page.latents = latent_map(policy, meta, source)
     page.latent_pictures = [data_uri(figure_bytes(f, PNG), PNG) for f in latent_figures(page.latents)]
 
 

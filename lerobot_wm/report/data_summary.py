@@ -15,6 +15,7 @@ from torch import Tensor
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.cache import frame_shape
 from lerobot_wm.data.schema import COLLECTION_RECORD
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.rewards import reward_columns
 from lerobot_wm.report.episodes import episodes_by_task
 from lerobot_wm.report.inline import WEBP, data_uri
@@ -49,18 +50,18 @@ class DataSummary:
     tasks: list[TaskSummary]
 
 
-def summarise_data(meta: LeRobotDatasetMetadata, root: str | Path | None) -> DataSummary:
+def summarise_data(meta: LeRobotDatasetMetadata, source: SourceConfig) -> DataSummary:
     """Summarise a dataset from its metadata and the first frame of each task.
 
     Args:
         meta: The dataset's.
-        root: Its folder; None for LeRobot's own place.
+        source: Where it is.
     """
     path = Path(meta.root) / COLLECTION_RECORD
     record = json.loads(path.read_text()) if path.is_file() else None
     by_task = episodes_by_task(meta)
     firsts = {task: episodes[0] for task, episodes in by_task.items()}
-    pictures = _first_frames(meta, root, sorted(firsts.values()))
+    pictures = _first_frames(meta, source, sorted(firsts.values()))
     all_lengths = meta.episodes["length"][:]
     tasks = []
     for task, episodes in by_task.items():
@@ -110,12 +111,12 @@ def _collection(config: dict[str, Any]) -> dict[str, str]:
 
 
 def _first_frames(
-    meta: LeRobotDatasetMetadata, root: str | Path | None, episodes: list[int]
+    meta: LeRobotDatasetMetadata, source: SourceConfig, episodes: list[int]
 ) -> dict[int, list[str]]:
     """The first frame of some episodes, in ascending order, as data URIs, one for each camera."""
     if not meta.camera_keys:
         return {episode: [] for episode in episodes}
-    dataset = LeRobotDataset(meta.repo_id, root=root, episodes=episodes)
+    dataset = LeRobotDataset(source.repo_id, root=source.root, revision=source.revision, episodes=episodes)
     all_lengths, start, pictures = meta.episodes["length"][:], 0, {}
     for episode in episodes:
         frame = dataset[start]

@@ -9,6 +9,7 @@ from lerobot.utils.io_utils import write_video
 from tqdm import tqdm
 
 from lerobot_wm.constants import TASK
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.dream import Dreams, dream
@@ -37,7 +38,7 @@ class DreamClip:
 
 
 def dream_clips(
-    policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, root: str | Path | None
+    policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig
 ) -> list[DreamClip]:
     """Dream of the last episode of each of the first tasks.
 
@@ -46,7 +47,7 @@ def dream_clips(
     Args:
         policy: The world model, or a policy on it.
         meta: A dataset that it can read, see `check_features`.
-        root: Its folder; None for LeRobot's own place.
+        source: Where it is.
     """
     by_task = episodes_by_task(meta, min_length=CONTEXT + 1)
     if isinstance(policy, LatentPolicy):
@@ -54,7 +55,7 @@ def dream_clips(
     chosen = sorted(episodes[-1] for episodes in list(by_task.values())[:MAX_DREAMS])
     if not chosen:
         return []
-    episodes = read_episodes(policy, meta, root, chosen, MAX_FRAMES)
+    episodes = read_episodes(policy, meta, source, chosen, MAX_FRAMES)
     return [
         _clip(dream(policy, episode, CONTEXT), episode[TASK], index, meta.fps)
         for index, episode in zip(tqdm(chosen, desc="Dreaming", unit="episode"), episodes, strict=True)

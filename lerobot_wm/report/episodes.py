@@ -1,7 +1,6 @@
 """Episodes of an image dataset as a world model is shown them: what it reads, and reading it."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, TASK
 from lerobot_wm.data.resize import resize_images
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
@@ -72,20 +72,18 @@ def episodes_by_task(meta: LeRobotDatasetMetadata, min_length: int = 1) -> dict[
 def read_episodes(
     policy: WMRSSMPolicy | LatentPolicy,
     meta: LeRobotDatasetMetadata,
-    root: str | Path | None,
+    source: SourceConfig,
     episodes: list[int],
     max_frames: int | None = None,
-    revision: str | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Read episodes one after another; no other's images are decoded.
 
     Args:
         policy: The model, or a policy on it.
         meta: The dataset's.
-        root: Its folder; None for LeRobot's own place.
+        source: Where it is.
         episodes: Which, in ascending order.
         max_frames: How many frames of each, from its first on; None reads it whole.
-        revision: Of a dataset on the Hub.
 
     Yields:
         What the policy reads of T frames: each camera (T, C, H, W) in [0, 1] at the model's image size, `action` (T, A)
@@ -97,9 +95,9 @@ def read_episodes(
     lengths = [all_lengths[episode] for episode in episodes]
     times = [step / meta.fps for step in range(min(max(lengths), _FRAMES_AT_ONCE))]
     dataset = LeRobotDataset(
-        meta.repo_id,
-        root=root,
-        revision=revision,
+        source.repo_id,
+        root=source.root,
+        revision=source.revision,
         episodes=episodes,
         delta_timestamps=dict.fromkeys(keys, times),
     )

@@ -1,7 +1,6 @@
 """A map of the latent space: the states s_t of some episodes, projected to the plane by PCA."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from sklearn.decomposition import PCA
 from tqdm import tqdm
 
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
@@ -53,14 +53,14 @@ class LatentMap:
 
 @torch.no_grad()
 def latent_map(
-    policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, root: str | Path | None
+    policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig
 ) -> LatentMap:
     """Filter the last episodes of each task, up to MAX_FRAMES, and project their latents, z_t at its posterior mean.
 
     Args:
         policy: Holds the world model.
         meta: A dataset that it can read, see `check_features`.
-        root: Its folder; None for LeRobot's own place.
+        source: Where it is.
     """
     world_model = policy.world_model
     assert isinstance(world_model, WorldModel)  # as load_world_model checked
@@ -69,7 +69,7 @@ def latent_map(
     episodes = sorted(index for of_task in by_task.values() for index in of_task[-per_task:])
     tasks = list(by_task)
     latents, task, time = [], [], []
-    read = read_episodes(policy, meta, root, episodes, MAX_FRAMES)
+    read = read_episodes(policy, meta, source, episodes, MAX_FRAMES)
     for episode in tqdm(read, total=len(episodes), desc="Mapping", unit="episode"):
         batch = {key: value[None].to(policy.config.device) for key, value in episode.items() if key != TASK}
         proprio = batch[OBS_STATE] if world_model.config.use_proprio else None

@@ -4,21 +4,22 @@ import logging
 import math
 from dataclasses import dataclass
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.constants import ACTION, OBS_STATE, TASK
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.cameras import camera_images, side_by_side
 from lerobot_wm.policies.frozen_encoder import load_encoder
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.report.episodes import episodes_by_task, shapes_read
+from lerobot_wm.report.episodes import episodes_by_task, read_episodes, shapes_read
 from lerobot_wm.world_model.model import WorldModel
 
 logger = logging.getLogger(__name__)
@@ -61,30 +62,38 @@ def load_world_model(path: str) -> WMRSSMPolicy | LatentPolicy:
     return policy.eval()
 
 
-def open_loop(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: str | None) -> list[OpenLoop]:
-    """Predict the last episodes of each task (those LeRobot's `eval_split` holds out); none where all are shorter."""
-    meta = LeRobotDatasetMetadata(repo_id, root=root)
+def open_loop(
+    policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig
+) -> list[OpenLoop]:
+    """Predict the last episodes of each task (those LeRobot's `eval_split` holds out); none where all are shorter.
+
+    Args:
+        policy: Holds the world model.
+        meta: A dataset that it can read, see `check_features`.
+        source: Where it is.
+    """
     by_task = episodes_by_task(meta, min_length=WINDOW)
     if not by_task:
-        logger.warning("%s has no episode of %d frames, which open-loop prediction needs.", repo_id, WINDOW)
+        logger.warning(
+            "%s has no episode of %d frames, which open-loop prediction needs.", meta.repo_id, WINDOW
+        )
         return []
-    first_frame = meta.episodes["dataset_from_index"][:]
-    times = [step / meta.fps for step in range(WINDOW)]
-    dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=dict.fromkeys(shapes_read(policy), times))
-    return [
-        predict(policy, task, [dataset[first_frame[i]] for i in episodes[-EPISODES_PER_TASK:]])
-        for task, episodes in tqdm(by_task.items(), desc="Imagining", unit="task")
-    ]
+    chosen = sorted(index for episodes in by_task.values() for index in episodes[-EPISODES_PER_TASK:])
+    windows: dict[str, list[dict[str, Any]]] = {task: [] for task in by_task}
+    read = read_episodes(policy, meta, source, chosen, WINDOW)
+    for window in tqdm(read, total=len(chosen), desc="Imagining", unit="episode"):
+        windows[window[TASK]].append(window)
+    return [predict(policy, task, of_task) for task, of_task in windows.items()]
 
 
 @torch.no_grad()
-def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[str, Tensor]]) -> OpenLoop:
+def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[str, Any]]) -> OpenLoop:
     """Filter the first CONTEXT frames of each window, imagine the rest under its actions.
 
     Args:
         policy: holds the world model.
         task: what the windows show.
-        windows: each the first WINDOW frames of an episode: what `shapes_read` names, (T, ·), images in [0, 1].
+        windows: each the first WINDOW frames of an episode, as of `read_episodes`.
     """
     config, world_model = policy.config, policy.world_model
     assert isinstance(world_model, WorldModel)  # as load_world_model checked

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import draccus
 import torch
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.constants import QUALITY_NAME
-from lerobot_wm.data.check import check_dataset
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.cameras import side_by_side
 from lerobot_wm.report.episodes import episodes_by_task, world_model_config
 from lerobot_wm.report.inline import PNG, SVG, figure_bytes
@@ -36,20 +35,12 @@ PROBE_EPISODES_PER_TASK = 40
 
 
 @dataclass
-class QualityDatasetConfig:
-    """A Meta-World dataset of `lerobot-wm collect`."""
-
-    repo_id: str
-    root: str | None = None
-
-
-@dataclass
 class QualityConfig:
     """Flags of `lerobot-wm quality`.
 
     Args:
         world_model_path: Folder or Hub id of a wm_rssm, wm_bc or wm_iql checkpoint.
-        dataset: Episodes to judge it on, of variations it was not trained on.
+        dataset: Episodes of `lerobot-wm collect` to judge it on, of variations it was not trained on.
         output_dir: Where quality.json and the figures go.
         train_dataset: What it was trained on; probes are fitted on its episodes of the tasks of `dataset`, and it
             has each of them. Without it they are fitted and tested on `dataset` by cross-validation over variations.
@@ -58,9 +49,9 @@ class QualityConfig:
     """
 
     world_model_path: str
-    dataset: QualityDatasetConfig
+    dataset: SourceConfig
     output_dir: Path
-    train_dataset: QualityDatasetConfig | None = None
+    train_dataset: SourceConfig | None = None
     seed: int = 0
     episodes_per_task: int = 10
 
@@ -138,21 +129,18 @@ def _read_datasets(cfg: QualityConfig, cameras: list[str]) -> tuple[list[Episode
     if cfg.train_dataset is not None:
         source = cfg.train_dataset
         tasks = _tasks_of_both(source, cfg.dataset)
-        training = read_episodes(
-            source.repo_id, source.root, cameras, PROBE_EPISODES_PER_TASK, cfg.seed, tasks
-        )
-    judged_on = cfg.dataset.repo_id
-    episodes = read_episodes(judged_on, cfg.dataset.root, cameras, cfg.episodes_per_task, cfg.seed)
+        training = read_episodes(source, cameras, PROBE_EPISODES_PER_TASK, cfg.seed, tasks)
+    episodes = read_episodes(cfg.dataset, cameras, cfg.episodes_per_task, cfg.seed)
     n_long = sum(len(episode.actions) >= WINDOW for episode in episodes)
     if n_long < 2:
         raise ValueError(
-            f"{judged_on} has {n_long} episodes of {WINDOW} frames among the {len(episodes)} chosen; open-loop "
-            "prediction with shuffled actions needs 2."
+            f"{cfg.dataset.repo_id} has {n_long} episodes of {WINDOW} frames among the {len(episodes)} chosen; "
+            "open-loop prediction with shuffled actions needs 2."
         )
     return training, episodes
 
 
-def _tasks_of_both(training: QualityDatasetConfig, judged_on: QualityDatasetConfig) -> list[str]:
+def _tasks_of_both(training: SourceConfig, judged_on: SourceConfig) -> list[str]:
     """The tasks to judge on; a warning where there is training data of others, of which nothing can be tested.
 
     Raises:
@@ -178,10 +166,9 @@ def _tasks_of_both(training: QualityDatasetConfig, judged_on: QualityDatasetConf
     return judged
 
 
-def _tasks(data: QualityDatasetConfig) -> list[str]:
+def _tasks(data: SourceConfig) -> list[str]:
     """The tasks that a dataset has episodes of."""
-    check_dataset(data.repo_id, data.root)
-    return list(episodes_by_task(LeRobotDatasetMetadata(data.repo_id, data.root)))
+    return list(episodes_by_task(data.metadata()))
 
 
 def _count_seen(training: list[Episode], episodes: list[Episode]) -> int:
@@ -199,7 +186,7 @@ def _count_seen(training: list[Episode], episodes: list[Episode]) -> int:
 
 def untrained(world_model: WorldModel, seed: int) -> WorldModel:
     """A world model of the same configuration and input scaling with fresh weights."""
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         fresh = WorldModel(world_model.config)
     scaling = {

@@ -12,8 +12,8 @@ from tqdm import trange
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, SUCCESS, VARIATION
 from lerobot_wm.data.cache import camera_frames
-from lerobot_wm.data.check import check_dataset
 from lerobot_wm.data.tables import column_tensor
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.cameras import stack_images
 from lerobot_wm.world_model.model import WorldModel
@@ -74,8 +74,7 @@ def choose_episodes(episodes: pd.DataFrame, per_task: int, seed: int) -> list[in
 
 
 def read_episodes(
-    repo_id: str,
-    root: str | None,
+    source: SourceConfig,
     cameras: list[str],
     per_task: int,
     seed: int,
@@ -84,8 +83,7 @@ def read_episodes(
     """Episodes of a Meta-World dataset; only those chosen are decoded.
 
     Args:
-        repo_id: The dataset's name.
-        root: Its folder; None for LeRobot's own place.
+        source: The dataset.
         cameras: Whose frames are read.
         per_task: Episodes wanted of each task.
         seed: Seed of the choice, see `choose_episodes`.
@@ -95,13 +93,14 @@ def read_episodes(
         DatasetError: The dataset is not whole.
         ValueError: The dataset lacks a feature, such as the objects' true positions.
     """
-    check_dataset(repo_id, root)
-    dataset = LeRobotDataset(repo_id, root=root)
-    missing = [key for key in (*cameras, *NEEDED) if key not in dataset.meta.features]
+    meta = source.metadata()
+    missing = [key for key in (*cameras, *NEEDED) if key not in meta.features]
     if missing:
         raise ValueError(
-            f"{repo_id} has no {missing}, which judging a world model needs: use a dataset of `lerobot-wm collect`."
+            f"{source.repo_id} has no {missing}, which judging a world model needs: use a dataset of "
+            "`lerobot-wm collect`."
         )
+    dataset = LeRobotDataset(source.repo_id, root=source.root, revision=source.revision)
     table = pd.DataFrame(
         {
             key: column_tensor(dataset.hf_dataset, key, (1,)).numpy()
@@ -112,7 +111,7 @@ def read_episodes(
     if of_tasks is not None:
         table = table[table["task_index"].isin([i for i, task in enumerate(tasks) if task in of_tasks])]
     chosen = choose_episodes(table.drop_duplicates("episode_index"), per_task, seed)
-    dataset = LeRobotDataset(repo_id, root=root, episodes=chosen)
+    dataset = LeRobotDataset(source.repo_id, root=source.root, revision=source.revision, episodes=chosen)
     of_cameras = [
         camera_frames(dataset, key, (IMAGE_SIZE, IMAGE_SIZE)) for key in cameras
     ]  # (N, 64, 64, C) each, by absolute index

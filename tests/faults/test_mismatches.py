@@ -6,11 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.latents import RECORD_PATH
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.pipeline.encode import encode
+from lerobot_wm.pipeline.publish import CheckpointFolder, PublishConfig, publish
 from tests.faults.breakage import set_entry
 from tests.faults.checkpoints import TASKS, WEIGHTS, last_line, load, make_checkpoint, record_demos
 from tests.flags import TRAIN_FLAGS
@@ -136,6 +141,22 @@ CASES = [
         TRAIN + "--policy.type=e2e_bc --sample_weighting.type=rabc",
         "--sample_weighting.type=rabc: e2e_bc has one loss for a batch",
     ),
+    (
+        "demos",
+        TRAIN + "--policy.type=e2e_bc --policy.n_obs_steps=2",
+        "--policy.n_obs_steps=2: these policies look at one frame at a time",
+    ),
+    (
+        "demos",
+        TRAIN
+        + "--policy.type=wm_rssm --policy.normalization_mapping={{'ACTION':'MEAN_STD','STATE':'IDENTITY'}}",
+        "--policy.normalization_mapping={'ACTION': 'MEAN_STD'}: scaling is part of these models",
+    ),
+    (
+        "demos",
+        GO_ON % "e2e_bc" + " --peft.method_type=LORA",
+        "--peft: e2e_bc takes no adapters. Its networks are small",
+    ),
     ("demos", TRAIN + "--policy.type=wm_bc", "--policy.type=wm_bc needs --policy.world_model_path="),
     (
         "demos",
@@ -255,6 +276,17 @@ def test_is_refused(
     assert says in last_line(command.format(data=flags, out=tmp_path / "out", **paths))
     assert set(cache.rglob("*")) == before, "images were decoded first"
     assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+def test_a_card_cannot_show_a_dataset_that_the_world_model_does_not_read(
+    paths: dict[str, Path], datasets: dict[str, LeRobotDataset], tmp_path: Path
+) -> None:
+    folder = shutil.copytree(paths["wm_rssm"], tmp_path / "checkpoint")
+    policy = PreTrainedConfig.from_pretrained(folder)
+    TrainPipelineConfig(DatasetConfig("test/demos"), policy=policy).save_pretrained(folder)
+    source = SourceConfig("test/cameras", str(datasets["cameras"].root))
+    with pytest.raises(ValueError, match=r"test/cameras has no observation\.image; it has"):
+        publish(PublishConfig(CheckpointFolder(folder), "user/wm", dataset=source))
 
 
 def test_the_order_of_tasks_is_the_checkpoints(

@@ -16,9 +16,9 @@ from torch.utils.data import DataLoader
 from lerobot_wm.data.errors import DatasetError
 from lerobot_wm.data.loader import RamDataset, RamLoader
 from lerobot_wm.envs.simulation import Simulation
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.pipeline.collect_shards import Shard, write_shard
 from lerobot_wm.pipeline.divergence import DivergenceError, LossWatch
-from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.faults.breakage import DATA, set_value
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
@@ -94,6 +94,22 @@ def test_training_on_broken_data_does_not_begin(
     line = train(lerobot_wm_command, dataset, tmp_path / "run")
     assert "next.reward holds NaN or Inf in episode 2 (task 'Lift'), frame 1" in line
     assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_a_policys_training_on_broken_data_encodes_nothing(
+    dataset: Path, tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    lerobot_wm_command(
+        f"init --policy.type=wm_rssm --policy.device=cpu {SMALL_WORLD_MODEL} --output_dir={tmp_path / 'wm'}",
+        f"--dataset.repo_id=test/faults --dataset.root={dataset}",
+    )
+    set_value(dataset, DATA.format(2), "action", row=1, value=[0.0, math.nan])
+    with pytest.raises(DatasetError, match=r"action holds NaN or Inf in episode 2 \(task 'Lift'\), frame 1"):
+        lerobot_wm_command(
+            f"train --policy.type=wm_bc --policy.world_model_path={tmp_path / 'wm' / 'pretrained_model'} --steps=1",
+            f"{TRAIN_FLAGS} --dataset.repo_id=test/faults --dataset.root={dataset} --output_dir={tmp_path / 'run'}",
+        )
+    assert not list(tmp_path.rglob("*.npy")), "images were decoded first"
 
 
 class Root(nn.Module):

@@ -38,6 +38,17 @@ def odd_repositories(hub: Hub) -> None:
         (f"{ENCODE}user/wm --dataset.repo_id=user/half", "write-user", "its upload did not finish"),
         (f"{ENCODE}user/wm@v9", "write-user", "model user/wm has no revision 'v9'"),
         (f"{ENCODE}outputs/no/such/folder", "write-user", "not a folder on this machine"),
+        (
+            "report --records={folder}/records.jsonl --dataset.repo_id=user/demos --dataset.revision=v9",
+            "write-user",
+            "it has the versions v3.0",
+        ),
+        (
+            "quality --world_model_path=user/wm --output_dir={folder}/x --dataset.repo_id=user/demos "
+            "--dataset.revision=v9",
+            "write-user",
+            "it has the versions v3.0",
+        ),
         (f"{EVAL}user/nothing", "", "no model user/nothing on the Hub"),
         ("publish --policy.path={folder} --repo_id=user/x", "write-user", "holds no train_config.json"),
         # The token does not do.

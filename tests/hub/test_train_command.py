@@ -159,7 +159,7 @@ UNUSUAL_POLICIES = {
     "e2e_bc": E2EBCConfig(
         device="cpu",
         use_amp=True,
-        normalization_mapping={"STATE": NormalizationMode.MIN_MAX},
+        normalization_mapping={"STATE": NormalizationMode.IDENTITY},
         image_key="a,b",
         encoder_image_size=(64, 48),
     ),

@@ -11,10 +11,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import ACTION, FPS, OBS_IMAGE, OBS_STATE
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.open_loop import WINDOW
-from lerobot_wm.report.quality import QualityConfig, QualityDatasetConfig, quality
+from lerobot_wm.report.quality import QualityConfig, quality
 from lerobot_wm.report.records import Record, record_line
 from lerobot_wm.world_model.config import RSSMConfig
 
@@ -107,6 +108,6 @@ def world_model_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def quality_path(demos_root: Path, world_model_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The quality.json of the untrained world model on the demonstrations, probed by cross-validation."""
-    dataset = QualityDatasetConfig("test/demos", str(demos_root))
+    dataset = SourceConfig("test/demos", str(demos_root))
     folder = tmp_path_factory.mktemp("quality")
     return quality(QualityConfig(str(world_model_path), dataset, folder, episodes_per_task=3))

@@ -14,7 +14,8 @@ from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
 from lerobot_wm.data.schema import COLLECTION_RECORD
-from lerobot_wm.report.build import ReportConfig, ReportDatasetConfig, report
+from lerobot_wm.hub.source import SourceConfig
+from lerobot_wm.report.build import ReportConfig, report
 from lerobot_wm.report.open_loop import WINDOW
 from lerobot_wm.report.records import Record, record_line
 from tests.recording import camera, record, vector
@@ -89,7 +90,7 @@ def index(tmp_path_factory: pytest.TempPathFactory, world_model_path: Path, qual
     config = write_hostile_run(folder, records)
     config.quality = quality_path
     config.world_model_path = str(world_model_path)
-    config.dataset = ReportDatasetConfig("test/recorded", str(folder / "data"))
+    config.dataset = SourceConfig("test/recorded", str(folder / "data"))
     return report(config)
 
 

@@ -13,8 +13,9 @@ from lerobot.utils.io_utils import write_video
 from PIL import Image
 
 from lerobot_wm import cli
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.report import build, videos
-from lerobot_wm.report.build import ReportConfig, ReportDatasetConfig, report
+from lerobot_wm.report.build import ReportConfig, report
 from lerobot_wm.report.inline import MP4, data_uri
 from lerobot_wm.report.records import record_line
 from tests.recording import record_stranger
@@ -106,7 +107,7 @@ def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, 
             videos=str(evaluation),
             train_logs=str(run),
             world_model_path=str(world_model_path),
-            dataset=ReportDatasetConfig("test/episodes", str(episodes_root)),
+            dataset=SourceConfig("test/episodes", str(episodes_root)),
         )
     )
     page = Page(index)
@@ -156,7 +157,7 @@ def test_episodes_too_short_to_imagine_do_not_cost_the_report(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("lerobot_wm.report.open_loop.WINDOW", 1000)
-    dataset = ReportDatasetConfig("test/episodes", str(episodes_root))
+    dataset = SourceConfig("test/episodes", str(episodes_root))
     index = report(
         ReportConfig(
             records=str(records_file),
@@ -172,7 +173,7 @@ def test_episodes_too_short_to_imagine_do_not_cost_the_report(
 
 
 def test_a_dataset_alone_is_described(records_file: Path, tmp_path: Path, episodes_root: Path) -> None:
-    dataset = ReportDatasetConfig("test/episodes", str(episodes_root))
+    dataset = SourceConfig("test/episodes", str(episodes_root))
     index = report(ReportConfig(records=str(records_file), output_dir=tmp_path / "report", dataset=dataset))
     page = Page(index)
     assert len(page.headings) == 4
@@ -236,7 +237,7 @@ def test_a_dataset_that_the_model_cannot_read_is_refused(
         records=str(records_file),
         output_dir=tmp_path / "report",
         world_model_path=str(world_model_path),
-        dataset=ReportDatasetConfig("test/recorded", str(tmp_path / "stranger")),
+        dataset=SourceConfig("test/recorded", str(tmp_path / "stranger")),
     )
     with pytest.raises(ValueError, match=r"test/recorded has no observation\.image; it has"):
         report(config)

@@ -9,6 +9,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.report.data_summary import summarise_data
 from tests.recording import FRAME_SHAPES, record_stranger
 
@@ -21,7 +22,7 @@ def picture(data_uri: str) -> np.ndarray:
 
 
 def test_of_collected_demonstrations(demos: LeRobotDataset) -> None:
-    summary = summarise_data(demos.meta, demos.root)
+    summary = summarise_data(demos.meta, SourceConfig(demos.repo_id, str(demos.root)))
     lengths = demos.meta.episodes["length"][:]
     assert [(t.task, t.name, t.expert, t.n_episodes) for t in summary.tasks] == [
         ("Reach a goal position", "reach-v3", "SawyerReachV3Policy", 4),
@@ -44,7 +45,10 @@ def test_of_collected_demonstrations(demos: LeRobotDataset) -> None:
 
 def test_of_any_dataset(tmp_path: Path) -> None:
     dataset = record_stranger(tmp_path / "data", lengths=(10, 12, 14, 16))
-    summary = summarise_data(LeRobotDatasetMetadata("test/recorded", root=tmp_path / "data"), dataset.root)
+    summary = summarise_data(
+        LeRobotDatasetMetadata("test/recorded", root=tmp_path / "data"),
+        SourceConfig("test/recorded", str(dataset.root)),
+    )
     assert [(t.task, t.name, t.expert, t.n_episodes, t.lengths) for t in summary.tasks] == [
         ("Pick up the cup", "", "", 2, (10, 13, 16)),
         ("Open the lid", "", "", 1, (12, 12, 12)),

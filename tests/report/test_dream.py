@@ -18,8 +18,8 @@ from PIL import Image
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, REWARD, SUCCESS, TASK
 from lerobot_wm.data.resize import resize_images
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.pipeline.dream import CheckpointConfig, DreamConfig, dream_of
-from lerobot_wm.pipeline.source import SourceConfig
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
@@ -148,7 +148,9 @@ def test_episodes_are_read_some_frames_at_a_time_and_at_the_models_size(
     monkeypatch.setattr("lerobot_wm.report.episodes._FRAMES_AT_ONCE", 7)
     first = 0
     for episode, length in zip(
-        read_episodes(policy, dataset.meta, root, [0, 1, 2], 20), (9, 20, 3), strict=True
+        read_episodes(policy, dataset.meta, SourceConfig("test/dream", str(root)), [0, 1, 2], 20),
+        (9, 20, 3),
+        strict=True,
     ):
         frames = [dataset[first + t] for t in range(length)]
         assert torch.equal(episode[ACTION], torch.stack([frame[ACTION] for frame in frames]))
@@ -272,15 +274,15 @@ def test_without_a_reward_head_there_is_no_curve(root: Path, tmp_path: Path) -> 
 def test_clips_are_of_tasks_that_the_policy_knows(
     root: Path, checkpoints: dict[str, Path], tmp_path: Path
 ) -> None:
-    meta = LeRobotDatasetMetadata("test/dream", root=root)
-    clips = dream_clips(load_world_model(str(checkpoints["wm_bc"])), meta, root)
+    meta, source = LeRobotDatasetMetadata("test/dream", root=root), SourceConfig("test/dream", str(root))
+    clips = dream_clips(load_world_model(str(checkpoints["wm_bc"])), meta, source)
     assert [(clip.task, clip.episode, clip.n_imagined) for clip in clips] == [
         ("lift it", 0, LENGTHS[0] - 5),
         ("drop it", 1, LENGTHS[1] - 5),
     ], "the last episode of each task that is longer than what is seen"
     assert clips[0].kinds == [TRUE_ACTIONS, ZERO_ACTIONS, OWN_ACTIONS]
     stranger = make_checkpoint(tmp_path, "wm_bc", tasks=["drop it", "iron it"])
-    assert [clip.task for clip in dream_clips(load_world_model(str(stranger)), meta, root)] == ["drop it"]
+    assert [clip.task for clip in dream_clips(load_world_model(str(stranger)), meta, source)] == ["drop it"]
 
 
 def test_video_frames_show_truth_and_dreams_side_by_side(dreams: Dreams) -> None:

@@ -9,6 +9,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.report.latents import FRAMES_PER_EPISODE, LatentMap, latent_figures, latent_map, task_colours
 from lerobot_wm.report.open_loop import load_world_model
 from lerobot_wm.world_model.rssm import RSSMState
@@ -20,11 +21,15 @@ def dataset(episodes_root: Path) -> LeRobotDataset:
     return LeRobotDataset("test/episodes", root=episodes_root)
 
 
+def source_of(dataset: LeRobotDataset) -> SourceConfig:
+    return SourceConfig(dataset.repo_id, str(dataset.root))
+
+
 @pytest.fixture(scope="module")
 def latents(dataset: LeRobotDataset, world_model_path: Path) -> LatentMap:
     policy = load_world_model(str(world_model_path))
     policy.world_model = lively_world_model(world_model_path)
-    return latent_map(policy, dataset.meta, dataset.root)
+    return latent_map(policy, dataset.meta, source_of(dataset))
 
 
 @torch.no_grad()
@@ -72,7 +77,7 @@ def test_episodes_of_several_tasks_are_counted_under_one(
     monkeypatch.setattr(
         meta, "episodes", meta.episodes.map(lambda row: {"tasks": ["approach", *row["tasks"]]})
     )
-    found = latent_map(policy, meta, dataset.root)
+    found = latent_map(policy, meta, source_of(dataset))
     assert found.tasks == ["approach"]
     assert set(found.task.tolist()) == {0}
 
@@ -91,7 +96,7 @@ def test_long_episodes_are_read_to_a_bound(
         return model_filter(images, *rest)
 
     monkeypatch.setattr(policy.world_model, "filter", noting)
-    found = latent_map(policy, dataset.meta, dataset.root)
+    found = latent_map(policy, dataset.meta, source_of(dataset))
     assert sorted(read) == [6, 6, 20, 20]
     assert found.max_frames == 20
     assert np.bincount(found.task).tolist() == [20 + 6] * 2

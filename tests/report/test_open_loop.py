@@ -7,22 +7,38 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot_wm.hub.source import SourceConfig
+from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
-from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model, open_loop, strips_figure
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from lerobot_wm.report.open_loop import (
+    CONTEXT,
+    HORIZONS,
+    WINDOW,
+    OpenLoop,
+    load_world_model,
+    open_loop,
+    strips_figure,
+)
 from tests.flags import SMALL_WORLD_MODEL
+
+
+def imagined(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: Path) -> list[OpenLoop]:
+    return open_loop(policy, LeRobotDatasetMetadata(repo_id, root=root), SourceConfig(repo_id, str(root)))
 
 
 @torch.no_grad()
 def test_imagination_follows_the_episodes_actions(world_model_path: Path, episodes_root: Path) -> None:
     """Equal to one step at a time: frame t is reached by the action executed at frame t - 1."""
     policy = load_world_model(str(world_model_path))
-    results = open_loop(policy, "test/episodes", str(episodes_root))
+    results = imagined(policy, "test/episodes", episodes_root)
     assert [(result.task, result.n_episodes) for result in results] == [
         ("Reach a goal position", 1),
         ("Push and close a window", 1),
@@ -48,7 +64,7 @@ def test_imagination_follows_the_episodes_actions(world_model_path: Path, episod
 
 
 def test_strips_show_truth_above_imagination(world_model_path: Path, episodes_root: Path) -> None:
-    results = open_loop(load_world_model(str(world_model_path)), "test/episodes", str(episodes_root))
+    results = imagined(load_world_model(str(world_model_path)), "test/episodes", episodes_root)
     axes = np.array(strips_figure(results).axes).reshape(2 * len(results), -1)
     shown = axes[2, 3].images[0].get_array()
     np.testing.assert_array_equal(shown, results[1].truth[CONTEXT - 1 + HORIZONS[2]].transpose(1, 2, 0))
@@ -73,7 +89,7 @@ def test_data_without_proprioception(tmp_path: Path, lerobot_wm_command: Callabl
         f"--output_dir={tmp_path / 'init'}",
     )
     policy = load_world_model(str(tmp_path / "init" / "pretrained_model"))
-    [result] = open_loop(policy, "test/images", str(root))
+    [result] = imagined(policy, "test/images", root)
     assert (result.task, result.n_episodes) == ("look", 1)
 
 

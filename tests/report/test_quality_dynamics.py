@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lerobot_wm.constants import OBS_IMAGE
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.report.quality_dynamics import drift, kl_quality, reward_quality
 from lerobot_wm.report.quality_episodes import Episode, Filtered, filter_episodes, read_episodes
 from lerobot_wm.world_model.model import WorldModel
@@ -23,7 +24,7 @@ def world_model(world_model_path: Path) -> WorldModel:
 
 @pytest.fixture(scope="module")
 def episodes(demos_root: Path) -> list[Episode]:
-    return read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=1, seed=0)
+    return read_episodes(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=1, seed=0)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.report.open_loop import WINDOW, load_world_model, predict
 from lerobot_wm.report.quality_episodes import (
     Episode,
@@ -28,7 +29,7 @@ from tests.report.quality_model import lively_world_model
 
 @pytest.fixture(scope="module")
 def episodes(demos_root: Path) -> list[Episode]:
-    chosen = read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=3, seed=0)
+    chosen = read_episodes(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=3, seed=0)
     return [episode for episode in chosen if len(episode.actions) >= WINDOW]
 
 
@@ -140,7 +141,7 @@ def test_episodes_are_spread_over_variations() -> None:
 
 
 def test_positions_tell_variations_apart(demos_root: Path) -> None:
-    episodes = read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=4, seed=0)
+    episodes = read_episodes(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=4, seed=0)
     names = {(episode.task, episode.variation) for episode in episodes}
     assert len(set(start_positions(episodes))) == len(names)
 
@@ -149,4 +150,4 @@ def test_a_dataset_without_positions_is_refused(episodes_root: Path) -> None:
     with pytest.raises(
         ValueError, match=r"test/episodes has no .*observation\.environment_state.*lerobot-wm collect"
     ):
-        read_episodes("test/episodes", str(episodes_root), [OBS_IMAGE], per_task=1, seed=0)
+        read_episodes(SourceConfig("test/episodes", str(episodes_root)), [OBS_IMAGE], per_task=1, seed=0)

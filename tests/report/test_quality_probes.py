@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from lerobot_wm.constants import OBS_IMAGE
+from lerobot_wm.hub.source import SourceConfig
 from lerobot_wm.report.open_loop import load_world_model
 from lerobot_wm.report.quality_episodes import filter_episodes, read_episodes
 from lerobot_wm.report.quality_probes import (
@@ -133,7 +134,7 @@ def test_one_task_needs_no_telling(frames: Frames) -> None:
 
 def test_frames_of_real_episodes(demos_root: Path, world_model_path: Path) -> None:
     world_model = load_world_model(str(world_model_path)).world_model
-    episodes = read_episodes("test/demos", str(demos_root), [OBS_IMAGE], per_task=2, seed=0)
+    episodes = read_episodes(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=2, seed=0)
     filtered = filter_episodes(world_model, episodes)
     frames = draw_frames(episodes, filtered, filtered, n_fit=2, seed=0)
     assert frames.to_fit.tolist() == [i < 2 for i in range(4) for _ in range(FRAMES_PER_EPISODE)]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.check import check_dataset, damage_named
@@ -16,6 +17,18 @@ class SourceConfig:
     repo_id: str
     root: str | None = None
     revision: str | None = None
+
+    def metadata(self) -> LeRobotDatasetMetadata:
+        """What is known of the dataset without its frames; downloaded where it is not on this machine.
+
+        Raises:
+            DatasetError: It is not whole.
+            HubRefusalError: It is to be downloaded, and has no such version.
+        """
+        check_dataset(self.repo_id, self.root, self.revision)
+        check_dataset_version(self.repo_id, self.root, self.revision)
+        with damage_named(self.repo_id, self.root, self.revision):
+            return LeRobotDatasetMetadata(self.repo_id, root=self.root, revision=self.revision)
 
     def open(self) -> LeRobotDataset:
         """The dataset, all of its episodes; downloaded where it is not on this machine.
