@@ -16,6 +16,7 @@ from benchmarks.measure import Result, measure_row
 from benchmarks.rows import ROWS, Row
 from benchmarks.table import WIDTH, markdown_table, results_table, rows_table, size_text
 from lerobot_wm.cores import cpu_kind, usable_cores
+from lerobot_wm.files import write_whole
 from lerobot_wm.report.provenance import provenance
 
 SCALES = {"small": 0.1, "normal": 1.0, "large": 10.0}
@@ -99,10 +100,7 @@ def write(results: list[Result], path: Path) -> None:
 
     old = json.loads(path.read_text()) if path.is_file() else []
     kept = {key(entry): entry for entry in [*old, *map(asdict, results)]}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".part")
-    partial.write_text(json.dumps(list(kept.values()), indent=1) + "\n")
-    partial.replace(path)
+    write_whole(path, json.dumps(list(kept.values()), indent=1) + "\n")
     path.with_suffix(".md").write_text(markdown_table(kept.values()))
 
 

@@ -48,6 +48,7 @@ def cache_root(dataset_root: Path) -> Path:
     Raises:
         PermissionError: The place cannot be written.
     """
+    dataset_root = Path(os.path.abspath(dataset_root))  # of `.` the name, and what is beside it
     place = os.environ.get(CACHE_VARIABLE)
     if place:
         root = Path(place) / dataset_root.name
@@ -208,6 +209,17 @@ class CameraCache:
         return open_memmap(path, mode="r+")
 
 
+def _tell_of_earlier_frames(folder: Path) -> None:
+    """Say that frames of other versions of the dataset lie beside: nobody else removes them."""
+    earlier = sorted(folder.parent.glob("frames-*"))
+    if earlier:
+        logger.warning(
+            "The dataset has changed: its frames are decoded anew. Remove those of earlier versions, %s, where no "
+            "training reads them any more.",
+            ", ".join(map(str, earlier)),
+        )
+
+
 def check_colours(dataset: LeRobotDataset, keys: Iterable[str]) -> None:
     """Refuse cameras whose pixels are distances, and videos of anything but three colours, which is what is decoded.
 
@@ -252,7 +264,9 @@ def camera_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int] | Non
     """
     check_colours(dataset, [key])
     folder = cache_root(Path(dataset.root)) / f"frames-{dataset_fingerprint(Path(dataset.root))}"
-    folder.mkdir(exist_ok=True)
+    if not folder.is_dir():
+        _tell_of_earlier_frames(folder)
+        folder.mkdir(exist_ok=True)
     cache = CameraCache(dataset, key, folder, size)
     cache.ensure(range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes)
     return torch.from_numpy(cache.frames)

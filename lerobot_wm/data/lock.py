@@ -29,6 +29,7 @@ def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> 
         BlockingIOError: Another process writes it.
         OSError: The folder cannot be written.
     """
+    output = Path(os.path.abspath(output))  # of `.` the name, and what is beside it
     output.parent.mkdir(parents=True, exist_ok=True)
     # Jobs share the lock of the whole, for which filelock has no kind; each holds its own alone.
     locks = {f".{output.name}.lock": fcntl.LOCK_EX if job is None else fcntl.LOCK_SH}

@@ -1,9 +1,9 @@
 """The records of an experiment: every finished arm and seed once, in files that are never half-written."""
 
-import os
 from pathlib import Path
 
 from lerobot_wm.experiment.preset import Preset
+from lerobot_wm.files import write_whole
 from lerobot_wm.report.records import Record, read_records, record_line
 
 type Runs = dict[tuple[str, int | None], list[Record]]  # by (arm, seed)
@@ -95,8 +95,4 @@ def by_run(records: list[Record]) -> Runs:
 
 
 def _write(path: Path, runs: Runs) -> None:
-    """Replace the file at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.part")
-    unfinished.write_text("".join(record_line(record) for rows in runs.values() for record in rows))
-    os.replace(unfinished, path)
+    write_whole(path, "".join(record_line(record) for rows in runs.values() for record in rows))

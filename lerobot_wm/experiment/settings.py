@@ -7,6 +7,7 @@ from typing import Any
 
 from lerobot_wm.experiment.arms import ARMS
 from lerobot_wm.experiment.preset import PRESET_FILE, Preset
+from lerobot_wm.files import write_whole
 
 SETTINGS_NAME = "settings.json"
 
@@ -46,10 +47,7 @@ def check_settings(preset: Preset, output_dir: Path) -> None:
     ]  # a new one changes nothing
     if changed:
         raise ValueError(_refusal(output_dir, changed, Path("lerobot_wm/experiment/arms.py")))
-    output_dir.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.part")
-    unfinished.write_text(json.dumps(known | now | {_ARMS: arms}, indent=1) + "\n")
-    unfinished.replace(path)
+    write_whole(path, json.dumps(known | now | {_ARMS: arms}, indent=1) + "\n")
 
 
 def _refusal(output_dir: Path, changed: list[str], file: Path) -> str:

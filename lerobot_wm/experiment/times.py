@@ -1,11 +1,11 @@
 """Wall times of stages, for the estimate of what is left."""
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 from lerobot_wm.experiment.stage import Stage
+from lerobot_wm.files import write_whole
 
 
 class Times:
@@ -24,10 +24,7 @@ class Times:
     def note(self, stage: Stage, seconds: float) -> None:
         """Add a finished stage, measured from its start: not one that went on from a checkpoint."""
         self._measured[stage.name] = {"kind": stage.kind, "seconds": round(seconds, 1)}
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = self._path.with_name(f"{self._path.name}.part")
-        unfinished.write_text(json.dumps(self._measured, indent=1) + "\n")
-        os.replace(unfinished, self._path)
+        write_whole(self._path, json.dumps(self._measured, indent=1) + "\n")
 
     def minutes(self, kind: str) -> float:
         """How long a stage of this kind takes: the mean of those measured, else what the preset states.

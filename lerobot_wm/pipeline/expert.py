@@ -14,6 +14,7 @@ from lerobot_wm.constants import MAX_EPISODE_STEPS, NUM_VARIATIONS, RECORDS_NAME
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import check_variation_set, is_seen, parse_variations
+from lerobot_wm.files import write_whole
 from lerobot_wm.pipeline.collect_episode import demonstrate
 from lerobot_wm.pipeline.quiet import quiet, silence
 from lerobot_wm.pipeline.records_file import new_records
@@ -82,10 +83,7 @@ def _write_records(cfg: ExpertConfig, tasks: tuple[str, ...]) -> list[Record]:
         for of_task in tqdm(_rollouts(cfg, tasks), total=len(tasks), desc="Rolling out", unit="task")
         for record in of_task
     ]
-    cfg.output_dir.mkdir(parents=True, exist_ok=True)
-    unfinished = cfg.records_file.with_name(f"{cfg.records_file.name}.part")
-    unfinished.write_text("".join(map(record_line, records)))
-    unfinished.rename(cfg.records_file)
+    write_whole(cfg.records_file, "".join(map(record_line, records)))
     return records
 
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.utils import STATS_PATH
 from torch import Tensor
 
 from lerobot_wm.constants import OBS_IMAGE
@@ -35,6 +37,21 @@ def training_dtype(dtype: str | None, device: str) -> str:
     if dtype not in (None, "bfloat16", "float32"):
         raise ValueError(f"dtype is '{dtype}'; expected 'bfloat16' or 'float32'.")
     return dtype or default_dtype(device)
+
+
+def check_has_stats(dataset_meta: LeRobotDatasetMetadata | None) -> None:
+    """Refuse a dataset to train on without statistics, which scale actions and proprioception.
+
+    LeRobot's loop goes on without them, and gives a policy that is made new none, as if it were a checkpoint's.
+
+    Raises:
+        ValueError: It has none; says how to have them computed.
+    """
+    if dataset_meta is not None and dataset_meta.stats is None:
+        raise ValueError(
+            f"{dataset_meta.repo_id} has no statistics ({dataset_meta.root}/{STATS_PATH}), which scale actions and "
+            "proprioception: have them computed with lerobot-edit-dataset --operation.type=recompute_stats."
+        )
 
 
 def feature_dim(features: dict[str, PolicyFeature], key: str) -> int:

@@ -11,7 +11,7 @@ from torchvision.utils import make_grid
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.policies.cameras import camera_images, check_observation, side_by_side
-from lerobot_wm.policies.features import stat
+from lerobot_wm.policies.features import check_has_stats, stat
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.latent_setup import check_latents, deployed_features, take_world_model
 from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
@@ -33,6 +33,7 @@ class LatentPolicy(MultiTaskPolicy):
         dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
+        check_has_stats(dataset_meta)
         anew = dataset_stats is not None
         world_model = take_world_model(config, anew=anew) if config.use_latent else None
         config.input_features = deployed_features(config)
@@ -166,7 +167,8 @@ class LatentPolicy(MultiTaskPolicy):
         if self._prev_action is None or self._prev_action.shape[0] != images.shape[0]:
             self._filter_state = None
             self._prev_action = images.new_zeros(images.shape[0], self.config.action_dim)
-        # At full precision, whatever evaluates: the latents that the policy was trained on are so, too.
+        # In float32, whatever evaluates: so are the latents that the policy was trained on. (On a GPU LeRobot's own
+        # loops have its products computed in TF32, which ours do not.)
         with torch.autocast(images.device.type, enabled=False):
             states = self.world_model.observe(
                 images[:, None], self._prev_action[:, None], self._filter_state, batch[OBS_STATE][:, None]

@@ -2,7 +2,7 @@
 
 from copy import copy, deepcopy
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import torch
 from huggingface_hub import ModelCard
@@ -104,6 +104,17 @@ class StrictPolicy(PreTrainedPolicy):
         if bad:
             raise ValueError(f"{model_file} {not_finite(bad)}")
         return model
+
+    def wrap_with_peft(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Refuse adapters (`--peft.*`): LeRobot loads their base with the settings of the trained policy.
+
+        Raises:
+            ValueError: Always; says what to do instead.
+        """
+        raise ValueError(
+            f"--peft: {self.name} takes no adapters. Its networks are small: leave the --peft flags out, and all "
+            "weights are trained on from --policy.path."
+        )
 
     def generate_model_card(
         self,

@@ -5,6 +5,7 @@ from typing import Any, NoReturn
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
+from lerobot_wm.policies.features import check_has_stats
 from lerobot_wm.policies.pretrained import StrictPolicy
 from lerobot_wm.policies.world_model_config import WorldModelConfig
 from lerobot_wm.world_model.interface import LatentModel
@@ -29,6 +30,7 @@ class WorldModelPolicy(StrictPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config)
+        check_has_stats(dataset_meta)
         config.validate_features()
 
     def get_optim_params(self) -> dict:

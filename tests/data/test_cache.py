@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_wm.data.cache import CameraCache
+from lerobot_wm.data.cache import CameraCache, cache_root, camera_frames
+from lerobot_wm.data.lock import sole_writer
+from tests.recording import FRONT, camera, record, vector
 
 PROCESSES, ROUNDS = 4, 25
 
@@ -38,6 +40,29 @@ def test_processes_that_start_together_share_one_file(tmp_path: Path) -> None:
         process.join()
     assert seen == [PROCESSES] * (PROCESSES * ROUNDS)
     assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_a_dataset_in_the_current_folder_has_its_cache_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "demos").mkdir()
+    monkeypatch.chdir(tmp_path / "demos")
+    assert cache_root(Path(".")) == tmp_path / "demos.cache"
+    with sole_writer(Path(".")):
+        assert (tmp_path / ".demos.lock").exists()
+
+
+def test_frames_of_earlier_versions_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Nothing removes them, and a large camera's take gigabytes."""
+    dataset = record(tmp_path / "demos", {FRONT: camera(8, 8), "action": vector(2)}, [("Push", 3)])
+    camera_frames(dataset, FRONT)
+    [first] = (tmp_path / "demos.cache").glob("frames-*")
+    camera_frames(dataset, FRONT)
+    assert not caplog.records
+    with (tmp_path / "demos" / "meta" / "info.json").open("a") as file:
+        file.write("\n")
+    camera_frames(dataset, FRONT)
+    assert [str(first) in record.message for record in caplog.records] == [True]
 
 
 def test_file_systems_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ optimizers, saving and loading, and checkpoints of earlier releases.
 import inspect
 import json
 from collections.abc import Callable
-from copy import deepcopy
+from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +136,16 @@ def test_the_factory_finds_policy_and_configuration(policy_type: str) -> None:
 def test_an_unknown_precision_is_refused(policy_type: str, dtype: str) -> None:
     with pytest.raises(ValueError, match=f"'{dtype}'; expected 'bfloat16' or 'float32'"):
         make_policy_config(policy_type, dtype=dtype)
+
+
+@pytest.mark.parametrize("policy_type", TRAINED)
+def test_a_dataset_without_statistics_is_refused(policy_type: str, make: Make) -> None:
+    """LeRobot's loop goes on without them: actions were then cut off at 1 in the dataset's units."""
+    made, source, _ = make(policy_type)
+    meta = copy(source.meta)
+    meta.stats = None
+    with pytest.raises(ValueError, match=r"has no statistics \(.*meta/stats\.json\), which scale actions"):
+        make_policy(made.policy, ds_meta=meta)
 
 
 @pytest.mark.parametrize("policy_type", TYPES)
