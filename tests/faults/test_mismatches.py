@@ -141,22 +141,6 @@ CASES = [
         TRAIN + "--policy.type=e2e_bc --sample_weighting.type=rabc",
         "--sample_weighting.type=rabc: e2e_bc has one loss for a batch",
     ),
-    (
-        "demos",
-        TRAIN + "--policy.type=e2e_bc --policy.n_obs_steps=2",
-        "--policy.n_obs_steps=2: these policies look at one frame at a time",
-    ),
-    (
-        "demos",
-        TRAIN
-        + "--policy.type=wm_rssm --policy.normalization_mapping={{'ACTION':'MEAN_STD','STATE':'IDENTITY'}}",
-        "--policy.normalization_mapping={'ACTION': 'MEAN_STD'}: scaling is part of these models",
-    ),
-    (
-        "demos",
-        GO_ON % "e2e_bc" + " --peft.method_type=LORA",
-        "--peft: e2e_bc takes no adapters. Its networks are small",
-    ),
     ("demos", TRAIN + "--policy.type=wm_bc", "--policy.type=wm_bc needs --policy.world_model_path="),
     (
         "demos",

@@ -37,6 +37,7 @@ class Rows(RamDataset):
 
     def windows(self, deltas: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """Rows and padding (N, T) of every row's window."""
+        self._offsets = {deltas: torch.tensor(deltas)}
         return self._window(torch.arange(len(self._first)), deltas)
 
 

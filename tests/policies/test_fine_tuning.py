@@ -481,13 +481,11 @@ def test_actions_are_compared_where_the_statistics_are(
 def test_a_new_training_with_the_settings_of_a_finished_one_sees_its_own_cameras(
     known: LeRobotDataset, checkpoints: dict[str, Path], tmp_path: Path
 ) -> None:
-    features = dict(known.meta.features)
-    features = {**features, FRONT: camera(40, 50)}
-    larger = record(tmp_path / "larger", features, [("Push", 6)])
+    larger = record(tmp_path / "larger", {**features(), **REWARDS, FRONT: camera(40, 52)}, [("Push", 6)])
     config = PreTrainedConfig.from_pretrained(checkpoints["e2e_bc"])
     size = config.encoder_image_size
     policy = make_policy(config, ds_meta=larger.meta)
-    assert policy.config.input_features[FRONT].shape == (3, 40, 50)
+    assert policy.config.input_features[FRONT].shape == (3, 40, 52)
     assert policy.config.encoder_image_size == size
 
 

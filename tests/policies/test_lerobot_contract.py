@@ -6,6 +6,7 @@ optimizers, saving and loading, and checkpoints of earlier releases.
 
 import inspect
 import json
+import re
 from collections.abc import Callable
 from copy import copy, deepcopy
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.factory import make_dataset
@@ -136,6 +137,30 @@ def test_the_factory_finds_policy_and_configuration(policy_type: str) -> None:
 def test_an_unknown_precision_is_refused(policy_type: str, dtype: str) -> None:
     with pytest.raises(ValueError, match=f"'{dtype}'; expected 'bfloat16' or 'float32'"):
         make_policy_config(policy_type, dtype=dtype)
+
+
+@pytest.mark.parametrize("policy_type", TYPES)
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"n_obs_steps": 2}, "n_obs_steps=2: these policies look at one frame at a time"),
+        (
+            {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}},
+            "normalization_mapping={'ACTION': 'MEAN_STD'}: scaling is part of these models",
+        ),
+    ],
+)
+def test_settings_of_other_policies_are_refused(policy_type: str, wrong: dict[str, Any], says: str) -> None:
+    """They were passed over, or scaled actions twice."""
+    with pytest.raises(ValueError, match=re.escape(f"--policy.{says}")):
+        make_policy_config(policy_type, **wrong)
+
+
+@pytest.mark.parametrize("policy_type", TRAINED)
+def test_adapters_are_refused(policy_type: str, make: Make) -> None:
+    """LeRobot would load their base with the tasks of the trained policy, for which it has no weights."""
+    with pytest.raises(ValueError, match=f"--peft: {policy_type} takes no adapters"):
+        make(policy_type)[2].wrap_with_peft(peft_cli_overrides={"target_modules": "all-linear"})
 
 
 @pytest.mark.parametrize("policy_type", TRAINED)
