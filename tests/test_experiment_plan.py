@@ -102,7 +102,7 @@ def test_every_command_line_is_understood(tmp_path: Path) -> None:
     assert report.world_model_path is not None
     stages["dataset"].artefact.unlink()
     report = parse(report_command(at, runs, tmp_path / "records.jsonl", tmp_path / "report"))
-    assert (report.world_model_path, report.dataset.repo_id) == (None, None), "the demonstrations are gone"
+    assert (report.world_model_path, report.dataset) == (None, None), "the demonstrations are gone"
 
 
 @pytest.mark.parametrize("name", ["cpu", "paper"])

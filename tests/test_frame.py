@@ -21,6 +21,7 @@ PACKAGE = ROOT / "lerobot_wm"
 LEVELS = {
     "constants": 0,
     "cores": 0,
+    "files": 0,
     "nn": 1,
     "world_model": 2,
     "rl": 2,
