@@ -25,8 +25,7 @@ class SourceConfig:
             DatasetError: It is not whole.
             HubRefusalError: It is to be downloaded, and has no such version.
         """
-        check_dataset(self.repo_id, self.root, self.revision)
-        check_dataset_version(self.repo_id, self.root, self.revision)
+        self._check()
         with damage_named(self.repo_id, self.root, self.revision):
             return LeRobotDatasetMetadata(self.repo_id, root=self.root, revision=self.revision)
 
@@ -37,9 +36,12 @@ class SourceConfig:
             DatasetError: It is not whole, or an observation, action or reward is not finite.
             HubRefusalError: It is to be downloaded, and has no such version.
         """
-        check_dataset(self.repo_id, self.root, self.revision)
-        check_dataset_version(self.repo_id, self.root, self.revision)
+        self._check()
         with damage_named(self.repo_id, self.root, self.revision):
             dataset = LeRobotDataset(self.repo_id, root=self.root, revision=self.revision)
         check_finite_dataset(dataset)
         return dataset
+
+    def _check(self) -> None:
+        check_dataset(self.repo_id, self.root, self.revision)
+        check_dataset_version(self.repo_id, self.root, self.revision)
