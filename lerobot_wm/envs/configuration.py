@@ -41,7 +41,7 @@ class MetaworldMTEnvConfig(EnvConfig):
         environment_state: add the full state, `observation.environment_state` (39,), to the observation.
         image_size: height and width of the image in pixels.
         camera_name: one of the model's cameras, or several separated by commas: corner2,topview.
-        fast_rendering: leave out shadows, reflections, multisampling and details of the robot that are a fifth of a pixel
+        fast_rendering: leave out shadows, reflections, multisampling and details of the robot a fifth of a pixel
             small.
         episode_length: steps until truncation, at most 500.
         obs_type: "pixels_agent_pos", the only kind.

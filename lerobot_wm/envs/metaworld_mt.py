@@ -46,8 +46,8 @@ class MetaworldMTEnv(gym.Env):
         image_size: height and width of the image in pixels.
         camera_name: one of the model's cameras, or several separated by commas; "corner2" is moved to where
             every task is in view.
-        fast_rendering: leave out shadows, reflections, multisampling and details of the robot that are a fifth of a
-            pixel small.
+        fast_rendering: leave out shadows, reflections, multisampling and details of the robot a fifth of a pixel
+            small.
         episode_length: steps until truncation, at most 500.
     """
 
