@@ -87,7 +87,7 @@ def test_every_command_line_is_understood(tmp_path: Path) -> None:
     parsed = {name: parse(stages[name].argv) for name in distinct.values()}
     assert {stages[name].argv[3] for name in parsed} == set(CONFIGS) - {"report"}
 
-    assert parsed["seed_0/wm_iql"].policy.sweep_betas == [0, 3, 10]
+    assert parsed["seed_0/wm_iql_sweep"].policy.sweep_betas == [0, 3, 10]
     assert parsed["seed_0/wm_rssm_proprio"].policy.rssm.use_proprio
     assert parsed["seed_0/state_bc"].policy.use_environment_state
     assert not parsed["seed_0/proprio_bc"].policy.use_latent
@@ -127,7 +127,7 @@ def test_data_of_each_arm(tmp_path: Path) -> None:
 
     assert root("wm_rssm") == root("e2e_iql") == root("proprio_bc") == root("state_bc") == "dataset"
     assert root("e2e_iql_dense") == root(f"e2e_iql_single_dense_{MT6[0]}") == "dataset_dense"
-    assert root("wm_bc") == root("wm_iql") == root(f"wm_bc_single_{MT6[0]}") == "seed_0/latents_wm_rssm"
+    assert root("wm_bc") == root("wm_iql_sweep") == root(f"wm_bc_single_{MT6[0]}") == "seed_0/latents_wm_rssm"
     assert root("frozen_bc") == "seed_0/latents_frozen_backbone"
     door = ",".join(map(str, range(130, 260)))
     assert f"--dataset.episodes=[{door}]" in stages["seed_0/e2e_bc_single_door-open-v3"].argv
@@ -141,11 +141,24 @@ def test_individual_arms_have_a_policy_per_task_and_share_the_rest(tmp_path: Pat
 
 def test_sweep_arms_roll_out_one_training(tmp_path: Path) -> None:
     stages = stages_of(tmp_path, "wm_iql", "wm_iql_beta0", "wm_iql_beta3", "wm_iql_beta10")
-    assert [name for name, stage in stages.items() if stage.kind == "wm_iql"] == ["seed_0/wm_iql"]
+    assert [name for name, stage in stages.items() if stage.kind == "wm_iql"] == ["seed_0/wm_iql_sweep"]
     evaluations = [stage for stage in stages.values() if stage.kind == "evaluate"]
     assert len(evaluations) == 4
     assert "--policy.beta=3" in stages["seed_0/eval_wm_iql_beta3"].argv
     assert not [flag for flag in stages["seed_0/eval_wm_iql"].argv if flag.startswith("--policy.beta")]
+
+
+def test_an_arm_alone_is_spared_the_actors_of_the_sweep(tmp_path: Path) -> None:
+    alone = stages_of(tmp_path, "wm_iql", "wm_bc")["seed_0/wm_iql"]
+    assert not [flag for flag in alone.argv if "sweep" in flag]
+    wanted: dict[str, list[int]] = {"wm_iql": [0, 1], "wm_iql_beta3": [0]}
+    at = replace(plan(tmp_path), preset=replace(load_preset("cpu"), arms=wanted))
+    runs = select_runs(at.preset, [], [])
+    assert [(arm.name, seed) for arm, seed in runs] == [
+        (name, seed) for name in wanted for seed in wanted[name]
+    ]
+    trainings = {stage.name for run in runs for stage in at.policies(*run)}
+    assert trainings == {"seed_0/wm_iql_sweep", "seed_1/wm_iql"}
 
 
 def test_a_finished_policy_needs_no_world_model(tmp_path: Path) -> None:

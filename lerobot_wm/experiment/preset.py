@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lerobot_wm.constants import NUM_VARIATIONS
 from lerobot_wm.envs.tasks import resolve_tasks
-from lerobot_wm.experiment.arms import ARMS, Arm
+from lerobot_wm.experiment.arms import ARMS, WM_IQL_IN_SWEEP, Arm
 
 CONFIGS = Path("configs")
 PRESET_FILE = "experiment.json"
@@ -104,7 +104,7 @@ def known_arm(name: str) -> Arm:
 
 
 def select_runs(preset: Preset, arms: list[str], seeds: list[int]) -> list[tuple[Arm, int]]:
-    """Every (arm, seed) asked for, in the order of tables.
+    """Every (arm, seed) asked for, in the order of tables; `wm_iql` is that of the sweep where there is one.
 
     Args:
         preset: Gives the arms and the seeds that are not named.
@@ -116,9 +116,14 @@ def select_runs(preset: Preset, arms: list[str], seeds: list[int]) -> list[tuple
         ValueError: an arm is unknown.
     """
     wanted = {known_arm(name).name for name in arms or preset.arms}
-    return [
+    runs = [
         (arm, seed)
         for name, arm in ARMS.items()
         if name in wanted
         for seed in ([0] if arm.config is None else seeds or preset.arms.get(name, [0]))
+    ]
+    with_sweep = {seed for arm, seed in runs if arm.training == WM_IQL_IN_SWEEP.training}
+    return [
+        (WM_IQL_IN_SWEEP if arm.name == WM_IQL_IN_SWEEP.name and seed in with_sweep else arm, seed)
+        for arm, seed in runs
     ]
