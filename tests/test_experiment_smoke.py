@@ -45,7 +45,7 @@ def test_every_arm_is_rolled_out_once(finished: Path) -> None:
 
 def test_a_training_that_was_killed_goes_on_from_its_checkpoint(finished: Path) -> None:
     finished = finished.rename(finished.with_name("moved"))  # the folder may have been moved, too
-    records = finished / "records.jsonl"
+    records = finished / "own_records.jsonl"  # what the folder rolled out; records.jsonl is made of it
     before = read_records([records])
     # As a kill after the first checkpoint leaves it.
     run = finished / "seed_0" / "wm_bc"
