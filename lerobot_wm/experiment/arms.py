@@ -63,7 +63,7 @@ _SWEEP_FLAG = f"--policy.sweep_betas=[{','.join(map(str, SWEEP_BETAS))}]"
 _NO_END = ("--policy.done_key=never",)  # a dense reward that success ended would teach to put it off
 _WM_IQL = Arm("wm_iql", "wm_iql", WM_RSSM)
 # Rolls out in place of it where an arm of the sweep is run, too: all betas are then on the same critics. Alone it is
-# spared the sweep's actors, which are half of an update's arithmetic.
+# spared the sweep's actors, three of the seven networks it trains.
 WM_IQL_IN_SWEEP = replace(_WM_IQL, trained_as="wm_iql_sweep", train_flags=(_SWEEP_FLAG,))
 
 # In the order of tables: the paper's arms, then the controls.
