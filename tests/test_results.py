@@ -117,11 +117,13 @@ def test_readme_shows_the_committed_measurements() -> None:
         lines = (ROOT / "results" / "benchmarks" / name).read_text().splitlines()
         return [cells(line) for line in lines[2:]]
 
-    without = {tuple(row[:3]): row[-1] for row in table("cpu2_float32.md")}
-    measured = {(*row[2:], without.get(tuple(row[:3]))) for row in table("cpu2.md")}
-    drawn_since = [row for row in table("cpu2_slower.md") if row[0].startswith("environment steps")]
-    # Those of the other two tables were measured with all of the robot drawn.
-    measured |= {(*row[2:], "") for row in drawn_since}
+    # Environment steps were measured there with all of the robot drawn.
+    without = {
+        tuple(row[:3]): row[-1]
+        for row in table("cpu2_float32.md")
+        if not row[0].startswith("environment steps")
+    }
+    measured = {(*row[2:], without.get(tuple(row[:3]), "")) for row in table("cpu2.md")}
     section = (ROOT / "README.md").read_text().split("\n## Speed\n")[1].split("\n## ")[0]
     *_, evaluation = [row for row in table("cpu2_float32.md") if row[2] == "lerobot-eval, metaworld"]
     ours, theirs = (cell.split()[0] for cell in evaluation[3:5])
