@@ -13,6 +13,7 @@ from lerobot_wm.report.records import Record, read_records
 from lerobot_wm.report.statistics import in_split, success_rate
 
 ROOT = Path(__file__).resolve().parents[1]
+RATE_BEFORE = ROOT / "results" / "cpu" / "constant_rate"  # float32 was compared with these rollouts
 TASKS = sorted(resolve_tasks("mt6"))  # the order of the columns
 
 
@@ -47,6 +48,7 @@ def test_readme_shows_the_committed_rollouts(preset: str, name: str) -> None:
     ("preset", "records", "tables"),
     [
         ("cpu", "records.jsonl", "success.md"),
+        ("cpu/constant_rate", "records.jsonl", "success.md"),
         ("best", "records.jsonl", "success.md"),
         ("best", "records_set44.jsonl", "success_set44.md"),
         ("mt10", "records.jsonl", "success.md"),
@@ -149,7 +151,7 @@ def test_precision_page_shows_the_committed_trainings_and_rollouts() -> None:
     script = runpy.run_path(str(ROOT / "scripts" / "compare_precision.py"))
     folder = ROOT / "results" / "precision"
     document = json.loads((folder / "precision.json").read_text())
-    half = [r for r in read_records([ROOT / "results" / "cpu" / "records.jsonl"]) if r["seed"] == 0]
+    half = [r for r in read_records([RATE_BEFORE / "records.jsonl"]) if r["seed"] == 0]
     assert script["success"](half, read_records([folder / "records_float32.jsonl"])) == document["success"]
     page = (folder / "README.md").read_text()
     assert all(table in page for table in script["tables"](document).split("\n\n"))
