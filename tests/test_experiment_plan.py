@@ -105,9 +105,12 @@ def test_every_command_line_is_understood(tmp_path: Path) -> None:
     assert (report.world_model_path, report.dataset) == (None, None), "the demonstrations are gone"
 
 
-@pytest.mark.parametrize(("name", "of_bc"), [("cpu", {"lr_decay_share": 0.5}), ("paper", {})])
+@pytest.mark.parametrize(
+    ("name", "of_bc", "on_latents"),
+    [("cpu", {"lr_decay_share": 0.5}, {}), ("paper", {}, {"updates_per_step": 20, "compile_model": True})],
+)
 def test_presets_differ_from_smoke_in_sizes_and_a_rate_of_all_bc(
-    name: str, of_bc: dict[str, float], tmp_path: Path
+    name: str, of_bc: dict[str, float], on_latents: dict[str, int], tmp_path: Path
 ) -> None:
     preset, smoke = load_preset(name), load_preset("smoke")
     stages = stages_of(tmp_path, *ARMS, preset=name)
@@ -119,7 +122,18 @@ def test_presets_differ_from_smoke_in_sizes_and_a_rate_of_all_bc(
             assert ours.keys() == theirs.keys()
             # One rate for all arms of BC: a comparison with those from scratch or blind is one of inputs alone.
             alike = of_bc if ours["policy"]["type"].endswith("_bc") else {}
-            assert ours["policy"] == theirs["policy"] | alike
+            # How a GPU is kept busy, which changes no update.
+            how = on_latents if ours["policy"]["type"] in ("wm_bc", "wm_iql") else {}
+            assert ours["policy"] == theirs["policy"] | alike | how
+
+
+def test_the_papers_batches_and_updates() -> None:
+    for arm in ARMS.values():
+        if arm.config is not None:
+            settings = json.loads(load_preset("paper").settings(arm.config).read_text())
+            updates = settings["policy"].get("updates_per_step", 1)
+            assert settings["batch_size"] / updates == 256
+            assert settings["steps"] * updates == 300_000 if "iql" in arm.config else 150_000
 
 
 def test_data_of_each_arm(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,13 @@ def lerobot_wm_iql(folder: Path, **size: Any) -> Prepared:
     return _prepared(LEROBOT, folder, "wm_iql", log_freq=2, **size)
 
 
+def in_one_step(folder: Path, policy: str, updates: int, batch: int, width: int, seconds: float) -> Prepared:
+    """Our command, a policy with networks of one width, several updates on `batch` samples each in a step."""
+    flags = (f"--policy.updates_per_step={updates}", f"--policy.hidden_dims=[{width},{width}]")
+    size = {"batch": updates * batch, "episodes_per_task": 16, "workers": 0, "seconds": seconds}
+    return _prepared(OURS, folder, policy, log_freq=max(1, 50 // updates), flags=flags, **size)
+
+
 def wm_bc(folder: Path, **size: Any) -> Prepared:
     """Our command, BC on latents."""
     return _prepared(OURS, folder, "wm_bc", log_freq=50, **size)
@@ -59,6 +67,7 @@ def _prepared(
     episodes_per_task: int,
     workers: int,
     seconds: float,
+    flags: Sequence[str] = (),
 ) -> Prepared:
     if policy == "wm_rssm":
         dataset, of_policy = demonstrations(folder, episodes_per_task), []
@@ -75,6 +84,7 @@ def _prepared(
         f"--num_workers={workers}",
         f"--log_freq={log_freq}",
         *("--steps=1000000", "--save_checkpoint=false", "--seed=0"),
+        *flags,
     ]
     warm_up = workers * PREFETCH_FACTOR  # these steps are fed with what was ready before
     return Prepared(lambda: _steps_per_second(command, folder, log_freq, warm_up, seconds))

@@ -1,5 +1,6 @@
 """The order in which LeRobot's sampler draws samples, looked up for a whole epoch at once."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,27 +16,36 @@ class EpochOrder:
 
     Args:
         sampler: LeRobot's; a state loaded into it counts from the next epoch on.
+        multiple: Each epoch is filled up with its first samples to a multiple of so many.
     """
 
-    def __init__(self, sampler: EpisodeAwareSampler) -> None:
+    def __init__(self, sampler: EpisodeAwareSampler, multiple: int = 1) -> None:
         self._sampler = sampler
         self._rows = torch.tensor(sampler.indices)  # (N,) dataset row of each position of the sampler
+        self._length = math.ceil(len(self._rows) / multiple) * multiple
 
     def __iter__(self) -> Iterator[int]:
         state = self._sampler.state_dict()
         iter(self._sampler)  # counts the epoch
         generator = self._sampler._epoch_generator(state["epoch"])
         order = torch.randperm(len(self._rows), generator=generator)  # (N,)
-        return iter(self._rows[order[state["start_index"] :]].tolist())
+        filled = order[torch.arange(state["start_index"], self._length) % len(order)]
+        return iter(self._rows[filled].tolist())
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return self._length
 
 
-def batches_of_rows(data_loader: DataLoader) -> Any:
-    """The batch sampler of a loader that LeRobot built, or a faster one of the same batches."""
+def batches_of_rows(data_loader: DataLoader, *, fill: bool = False) -> Any:
+    """The batch sampler of a loader that LeRobot built, or a faster one of the same batches.
+
+    Args:
+        data_loader: The loader.
+        fill: Fill the last batch of an epoch that is shuffled up with the epoch's first samples.
+    """
     sampler = data_loader.sampler
     if not (isinstance(sampler, EpisodeAwareSampler) and sampler.shuffle):
         return data_loader.batch_sampler
-    assert data_loader.batch_size is not None  # LeRobot's loaders batch
-    return BatchSampler(EpochOrder(sampler), data_loader.batch_size, data_loader.drop_last)
+    size = data_loader.batch_size
+    assert size is not None  # LeRobot's loaders batch
+    return BatchSampler(EpochOrder(sampler, size if fill else 1), size, data_loader.drop_last)

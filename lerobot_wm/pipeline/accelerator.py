@@ -18,6 +18,7 @@ from torch.optim import Optimizer
 from lerobot_wm.data.loader import RamLoader
 from lerobot_wm.data.order import batches_of_rows
 from lerobot_wm.pipeline.divergence import LossWatch
+from lerobot_wm.pipeline.updates import Updates, updates_per_step
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.features import names_before
 from lerobot_wm.policies.fits import check_environment_fits
@@ -38,6 +39,7 @@ class RamAccelerator(Accelerator):
         super().__init__(**kwargs)
         self._train_config = train_config
         self._watch = LossWatch()
+        self._updates: Updates | None = None
         self._loaders: list[RamLoader] = []  # that of the training data first
 
     def prepare_model(self, model: Any, *args: Any, **kwargs: Any) -> Any:
@@ -50,6 +52,8 @@ class RamAccelerator(Accelerator):
         if cfg.env is not None and cfg.env_eval_freq > 0:  # now, not when the first evaluation is due
             check_environment_fits(cfg.policy, cfg.env, cfg.rename_map)
         prepared = super().prepare_model(model, *args, **kwargs)
+        if (n := updates_per_step(cfg)) > 1:
+            self._updates = Updates(prepared, cfg.batch_size // n, cfg.optimizer.grad_clip_norm)
         self._watch.attach(prepared)
         if self.distributed_type == DistributedType.NO:  # nothing exchanges them once training runs
             # LeRobot asks for them at every step, and a walk through a frozen world model takes longer than what
@@ -66,6 +70,8 @@ class RamAccelerator(Accelerator):
         prepared = super().prepare_optimizer(optimizer, device_placement)
         if self.scaler is None:
             prepared.step, prepared.zero_grad = optimizer.step, optimizer.zero_grad
+        if self._updates is not None:
+            self._updates.optimizer = optimizer
         return prepared
 
     def unwrap_model(
@@ -83,7 +89,7 @@ class RamAccelerator(Accelerator):
         """Go backward as accelerate does, and stop the training where that gives no finite gradient.
 
         Raises:
-            DivergenceError: The loss or its gradient is NaN or infinite; the weights are still those before the step.
+            DivergenceError: The loss or its gradient is NaN or infinite.
         """
         super().backward(loss, **kwargs)
         if self.scaler is None:  # that of float16 skips such steps by itself
@@ -94,9 +100,10 @@ class RamAccelerator(Accelerator):
         """Replace the loader by one that reads the same samples, this process's share of them, from memory.
 
         Step k of W processes reads batches kW to kW + W - 1 of the epoch, one each: together the batch of one process
-        with a W times larger batch size. An epoch's last step is filled up with the epoch's first samples.
+        with a W times larger batch size. An epoch's last step is filled up with the epoch's first samples, also where a
+        step's batch is shared by several updates.
         """
-        batch_sampler = batches_of_rows(data_loader)
+        batch_sampler = batches_of_rows(data_loader, fill=updates_per_step(self._train_config) > 1)
         if self.num_processes > 1:
             batch_sampler = BatchSamplerShard(batch_sampler, self.num_processes, self.process_index)
         with self.in_turn():  # the first decodes the frames, the others map them

@@ -1,4 +1,4 @@
-"""Training stops at the first loss or gradient that is not finite, before it reaches the weights."""
+"""Training stops at the first loss or gradient that is not finite, before it reaches a checkpoint."""
 
 from collections.abc import Callable, Iterator
 from functools import wraps
@@ -68,7 +68,7 @@ class LossWatch:
             else "none is saved yet"
         )
         raise DivergenceError(
-            f"training diverged: {parts} is NaN or Inf {where}. It did not reach the weights; {saved}. "
+            f"training diverged: {parts} is NaN or Inf {where}. It reached no checkpoint; {saved}. "
             f"{self._mend(last_checkpoint.exists())}"
         )
 

@@ -22,6 +22,7 @@ from lerobot_wm.pipeline.memory import keep_freed_memory
 from lerobot_wm.pipeline.processors import check_policy_path, check_processors
 from lerobot_wm.pipeline.train_resume import clear_unfinished, how_to_go_on, restore_last, stops_explained
 from lerobot_wm.pipeline.training_run import check_run_settings, check_training_state
+from lerobot_wm.pipeline.updates import check_updates
 from lerobot_wm.policies.cameras import ImagePolicyConfig
 from lerobot_wm.policies.checkpoint import read_config
 from lerobot_wm.policies.fine_tuning import names_given_by
@@ -148,6 +149,7 @@ def train(cfg: TrainPipelineConfig) -> None:
     if cfg.resume:
         check_training_state(cfg.checkpoint_path)
     accelerator = make_accelerator(cfg)
+    check_updates(cfg, accelerator.num_processes)
     if cfg.policy.push_to_hub and accelerator.is_main_process:
         check_can_push(cfg.policy.repo_id)  # now, not when hours of training are over
     with (

@@ -1,4 +1,4 @@
-"""What `wm_iql` and `e2e_iql` share: the agent of a configuration, its rewards, and its loss on LeRobot's batches."""
+"""What `wm_iql` and `e2e_iql` share: the agent of a configuration, and what LeRobot's batches tell of an action."""
 
 from typing import Any
 
@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import DONE, SUCCESS
 from lerobot_wm.policies.iql_config import NEVER, IQLConfig
-from lerobot_wm.policies.parts import logged
 from lerobot_wm.policies.rewards import FrameLabel, reward_columns
 from lerobot_wm.rl.agent import IQLAgent
 
@@ -46,7 +45,7 @@ def make_agent(config: IQLConfig, observation_dim: int, *, anew: bool) -> IQLAge
 
 
 class Outcomes(nn.Module):
-    """What came of an action, in training: its reward, and whether it ended the task.
+    """What came of an action, in training: its reward, whether it ended the task, and whether the data goes on.
 
     A task ends where the configuration's `done_key` is true, and nowhere where that is `NEVER`.
 
@@ -64,11 +63,28 @@ class Outcomes(nn.Module):
         self.reward = FrameLabel(config.reward_key, dataset_meta)
         self.end = None if end is None else FrameLabel(end, dataset_meta)
 
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        """Rewards (B,) and ends (B,) bool."""
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor]:
+        """What `IQLAgent.loss` is told beside observations and action.
+
+        Args:
+            batch: `next.reward` (B,) and `next.done` (B,), or `index` (B,) where other columns are read in their place;
+                an observation's `_is_pad` (B, 2) at t and t+1.
+
+        Returns:
+            Rewards (B,), ends (B,) bool, and where there is a next observation, (B,) bool.
+        """
         reward = self.reward(batch).flatten()
         end = torch.zeros_like(reward) if self.end is None else self.end(batch).flatten()
-        return reward, end.bool()
+        return reward, end.bool(), ~_past_the_end(batch)
+
+
+def _past_the_end(batch: dict[str, Any]) -> Tensor:
+    """Where t+1 lies beyond the episode, (B,) bool; all observations are read at the same times.
+
+    Names of observations may have been changed by `--rename_map`, which leaves those of their padding as they are.
+    """
+    names = (key for key in batch if key.startswith(f"{OBS_STR}.") and key.endswith("_is_pad"))
+    return batch[next(names)][:, 1]
 
 
 def end_column(config: IQLConfig, dataset_meta: LeRobotDatasetMetadata) -> str | None:
@@ -92,43 +108,3 @@ def end_column(config: IQLConfig, dataset_meta: LeRobotDatasetMetadata) -> str |
             f"--policy.type={config.type.replace('iql', 'bc')}, which needs none."
         )
     return None if end == NEVER else end
-
-
-def batch_loss(
-    agent: IQLAgent,
-    outcomes: Outcomes,
-    observation: Tensor,
-    next_observation: Tensor,
-    action: Tensor,
-    batch: dict[str, Any],
-) -> tuple[Tensor, dict[str, float]]:
-    """The agent's loss and its parts by name.
-
-    Args:
-        agent: The agent.
-        outcomes: Reads the rewards.
-        observation: The heads' input at t, (B, O).
-        next_observation: At t+1, (B, O).
-        action: Scaled to [-1, 1], (B, A).
-        batch: `next.reward` (B,) and `next.done` (B,), or `index` (B,) where other columns are read in their place;
-            an observation's `_is_pad` (B, 2) at t and t+1.
-    """
-    reward, terminal = outcomes(batch)  # (B,) each
-    loss, parts = agent.loss(
-        observation,
-        next_observation,
-        action,
-        reward=reward,
-        terminal=terminal,
-        has_next=~_past_the_end(batch),
-    )
-    return loss, logged(parts)
-
-
-def _past_the_end(batch: dict[str, Any]) -> Tensor:
-    """Where t+1 lies beyond the episode, (B,) bool; all observations are read at the same times.
-
-    Names of observations may have been changed by `--rename_map`, which leaves those of their padding as they are.
-    """
-    names = (key for key in batch if key.startswith(f"{OBS_STR}.") and key.endswith("_is_pad"))
-    return batch[next(names)][:, 1]

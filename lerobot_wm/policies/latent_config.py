@@ -26,6 +26,9 @@ class LatentPolicyConfig(CompileConfig, ImagePolicyConfig, MultiTaskConfig):
         use_latent: False leaves the latent out: the blind control, proprioception and task id only.
         use_environment_state: True adds the simulator's full state, `observation.environment_state`: with
             `use_latent=false` the control that is given the truth. The environment has to emit it.
+        updates_per_step: Into how many updates a step of `lerobot-wm train` divides its batch, one after the other on
+            batch_size / updates_per_step samples each. Of a step of LeRobot's loop, what is not the update takes longer
+            than an update of these small networks on a GPU. Schedules move on, and the loss is logged, once a step.
         save_predicted_video: True has `lerobot-eval` write, beside its videos, one of each batch of rollouts
             (`pred_episode_N.mp4`): what the world model expected to see at every step, and on its right what it saw.
         world_model, image_key, world_model_fingerprint: Taken from that checkpoint when the policy is made.
@@ -35,6 +38,7 @@ class LatentPolicyConfig(CompileConfig, ImagePolicyConfig, MultiTaskConfig):
     world_model_path: str | None = None
     use_latent: bool = True
     use_environment_state: bool = False
+    updates_per_step: int = 1
     save_predicted_video: bool = False
     world_model: WorldModelConfig | None = None
     world_model_fingerprint: str | None = None
@@ -43,6 +47,8 @@ class LatentPolicyConfig(CompileConfig, ImagePolicyConfig, MultiTaskConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.updates_per_step < 1:
+            raise ValueError(f"updates_per_step is {self.updates_per_step}; a step makes 1 or more.")
         if self.rssm is not None or self.frozen_backbone is not None:
             self.world_model = self._world_model_of_0_1_0()
             self.rssm = self.frozen_backbone = None

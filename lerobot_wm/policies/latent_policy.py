@@ -15,13 +15,14 @@ from lerobot_wm.policies.features import check_has_stats, stat
 from lerobot_wm.policies.latent_config import LatentPolicyConfig
 from lerobot_wm.policies.latent_setup import check_latents, deployed_features, take_world_model
 from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
+from lerobot_wm.policies.parts import logged
 from lerobot_wm.world_model.interface import LatentModel, LatentState
 
 
 class LatentPolicy(MultiTaskPolicy):
     """Base of `wm_bc` and `wm_iql`: holds the frozen world model, or what stands in its place, and the filter's state.
 
-    Subclasses define `actor_mean` and `forward`.
+    Subclasses define `actor_mean`, and the training loss by `training_inputs` and `loss`.
     """
 
     config: LatentPolicyConfig
@@ -116,6 +117,32 @@ class LatentPolicy(MultiTaskPolicy):
             frame(OBS_LATENT) if self.config.use_latent else None,
             frame(OBS_ENV_STATE) if self.config.use_environment_state else None,
         )
+
+    def training_inputs(self, batch: dict[str, Any]) -> tuple[Tensor, ...]:
+        """What the loss is taken of, from a training batch: a row for each of its samples, (B, ...) each."""
+        raise NotImplementedError
+
+    def loss(self, *inputs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The scalar loss of some rows of `training_inputs`, and its parts by name: detached scalars."""
+        raise NotImplementedError
+
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
+        """The loss of a training batch, as `training_inputs` describes it.
+
+        Returns:
+            The scalar loss and its parts by name.
+
+        Raises:
+            ValueError: In training, with several updates in a step: `lerobot-wm train` makes them, in this one's place.
+        """
+        if self.training and self.config.updates_per_step > 1:
+            raise ValueError(
+                f"--policy.updates_per_step={self.config.updates_per_step} is for lerobot-wm train, which takes the "
+                "flags of lerobot-train: train by it, or leave the flag out (of a policy that was trained with it: "
+                "--policy.updates_per_step=1)."
+            )
+        loss, parts = self.loss(*self.training_inputs(batch))
+        return loss, logged(parts)
 
     def reset(self) -> None:
         """Forget the episode: the next call of `select_action` starts the filter anew."""

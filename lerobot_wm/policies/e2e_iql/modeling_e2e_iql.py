@@ -11,7 +11,8 @@ from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.cameras import camera_images
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
 from lerobot_wm.policies.e2e_policy import E2EPolicy
-from lerobot_wm.policies.iql_agent import Outcomes, batch_loss, make_agent
+from lerobot_wm.policies.iql_agent import Outcomes, make_agent
+from lerobot_wm.policies.parts import logged
 
 
 class E2EIQLPolicy(E2EPolicy):
@@ -64,9 +65,9 @@ class E2EIQLPolicy(E2EPolicy):
         now = self.observation(images[:, 0], states[:, 0], tasks)  # (B, O)
         with torch.no_grad():
             following = self.observation(images[:, 1], states[:, 1], tasks)  # (B, O)
-        return batch_loss(
-            self.agent, self.outcomes, now, following, self.action_scaling(batch[ACTION]), batch
-        )
+        action = self.action_scaling(batch[ACTION])  # (B, A)
+        loss, parts = self.agent.loss(now, following, action, *self.outcomes(batch))
+        return loss, logged(parts)
 
     def update(self) -> None:
         """Move the target critics; LeRobot calls this after every optimizer step."""

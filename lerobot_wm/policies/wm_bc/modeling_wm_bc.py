@@ -38,20 +38,20 @@ class WMBCPolicy(LatentPolicy):
         """The regressed action (B, A) for observations (B, O)."""
         return self.actor(observation)
 
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
-        """Mean squared error on a batch of frames.
+    def training_inputs(self, batch: dict[str, Any]) -> tuple[Tensor, ...]:
+        """What the loss is taken of.
 
         Args:
             batch: `observation.latent` (B, L), `observation.state` (B, P), `action` (B, A), `task` (B strings), and
                 `observation.environment_state` (B, F) with `use_environment_state`.
 
         Returns:
-            The scalar loss, and no parts: the loss is all there is.
+            Observations (B, O) and scaled actions (B, A).
         """
         tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
-        observation = self.observation_at(batch, tasks)  # (B, O)
-        return self.loss(observation, self.action_scaling(batch[ACTION])), {}
+        return self.observation_at(batch, tasks), self.action_scaling(batch[ACTION])
 
-    def loss(self, observation: Tensor, action: Tensor) -> Tensor:
-        """The scalar loss for observations (B, O) and scaled actions (B, A)."""
-        return bc_loss(self.actor(observation), action)
+    def loss(self, *inputs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean squared error of frames, and no parts: the loss is all there is."""
+        observation, action = inputs
+        return bc_loss(self.actor(observation), action), {}

@@ -8,7 +8,7 @@ from torch import Tensor
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.compile import compiled
-from lerobot_wm.policies.iql_agent import Outcomes, batch_loss, make_agent
+from lerobot_wm.policies.iql_agent import Outcomes, make_agent
 from lerobot_wm.policies.latent_policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 
@@ -44,8 +44,8 @@ class WMIQLPolicy(LatentPolicy):
         """Mean of the policy's Gaussian (B, A) for observations (B, O)."""
         return self.agent.mean_action(observation, self.config.beta)
 
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
-        """Value, critic and actor losses on a batch of transitions.
+    def training_inputs(self, batch: dict[str, Any]) -> tuple[Tensor, ...]:
+        """What the losses are taken of.
 
         Args:
             batch: `observation.latent` (B, 2, L) and `observation.state` (B, 2, P) at t and t+1,
@@ -53,14 +53,16 @@ class WMIQLPolicy(LatentPolicy):
                 `task` (B strings), and `observation.environment_state` (B, 2, F) with `use_environment_state`.
 
         Returns:
-            The sum of the losses and its parts by name.
+            The arguments of `IQLAgent.loss`.
         """
         tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
         now, following = (self.observation_at(batch, tasks, t) for t in (0, 1))  # (B, O) each
-        return batch_loss(
-            self.agent, self.outcomes, now, following, self.action_scaling(batch[ACTION]), batch
-        )
+        return now, following, self.action_scaling(batch[ACTION]), *self.outcomes(batch)
+
+    def loss(self, *inputs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Value, critic and actor losses of transitions: their sum, and its parts by name."""
+        return self.agent.loss(*inputs)
 
     def update(self) -> None:
-        """Move the target critics; LeRobot calls this after every optimizer step."""
+        """Move the target critics; called after every optimizer step."""
         self.agent.update_target()
