@@ -133,7 +133,7 @@ def test_the_papers_batches_and_updates() -> None:
             settings = json.loads(load_preset("paper").settings(arm.config).read_text())
             updates = settings["policy"].get("updates_per_step", 1)
             assert settings["batch_size"] / updates == 256
-            assert settings["steps"] * updates == 300_000 if "iql" in arm.config else 150_000
+            assert settings["steps"] * updates == (300_000 if "iql" in arm.config else 150_000)
 
 
 def test_data_of_each_arm(tmp_path: Path) -> None:
