@@ -85,12 +85,14 @@ def test_labels_of_frames_are_found_by_index(dataset: LeRobotDataset) -> None:
 def test_outcomes_of_sparse_and_dense_reward(dataset: LeRobotDataset) -> None:
     """Without next.done a task ends at success, whichever the reward."""
     batch = {"index": torch.tensor([0, 6, 8]), "next.reward": torch.tensor([1.0, 7.0, 2.0])}
+    batch["observation.state_is_pad"] = torch.tensor([[False, False], [False, True], [False, False]])
     for key, expected in (("next.success", [0, 1, 0]), ("next.reward", [1, 7, 2])):
-        reward, ends = Outcomes(make_policy_config("e2e_iql", reward_key=key, device="cpu"), dataset.meta)(
-            batch
-        )
+        reward, ends, goes_on = Outcomes(
+            make_policy_config("e2e_iql", reward_key=key, device="cpu"), dataset.meta
+        )(batch)
         assert reward.tolist() == expected
         assert ends.tolist() == [False, True, False]
+        assert goes_on.tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("reward_key", ["next.reward", "next.success"])
