@@ -179,6 +179,7 @@ def test_where_a_task_ends_can_be_named(tmp_path: Path) -> None:
         "index": torch.arange(4),
         "next.done": torch.tensor([0.0, 0, 0, 1]),
         "next.reward": torch.zeros(4),
+        "observation.state_is_pad": torch.zeros(4, 2, dtype=torch.bool),
     }
     for done_key, expected in (
         (None, [False] * 3 + [True]),
