@@ -15,9 +15,9 @@ from benchmarks.environments import ROOT
 from benchmarks.measure import Result, measure_row
 from benchmarks.rows import ROWS, Row
 from benchmarks.table import WIDTH, markdown_table, results_table, rows_table, size_text
-from lerobot_wm.cores import cpu_kind, usable_cores
 from lerobot_wm.files import write_whole
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
+from lerobot_wm.system import cpu_kind, usable_cores
 
 SCALES = {"small": 0.1, "normal": 1.0, "large": 10.0}
 

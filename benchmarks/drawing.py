@@ -19,7 +19,7 @@ import numpy as np
 from lerobot_wm.envs import rendering
 from lerobot_wm.envs.rendering import Renderer, RenderKey
 from lerobot_wm.envs.simulation import Simulation
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
 
 VIEWS = [
     (64, "corner2"),

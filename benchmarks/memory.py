@@ -29,12 +29,12 @@ from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import BatchSampler
 
+from lerobot_wm.collect.merge import merge_datasets
 from lerobot_wm.constants import FPS, OBS_IMAGE
 from lerobot_wm.data.cache import CACHE_VARIABLE, cache_root
 from lerobot_wm.data.loader import RamDataset
 from lerobot_wm.data.schema import metaworld_features
-from lerobot_wm.pipeline.merge import merge_datasets
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
 
 SIZE, LENGTH, EPISODES = 64, 100, 20  # pixels, frames of an episode, episodes of the piece that is repeated
 PIECE_BYTES = EPISODES * LENGTH * SIZE * SIZE * 3

@@ -19,7 +19,7 @@ from typing import Any
 
 from benchmarks.measure import THREAD_VARIABLES
 from benchmarks.sides.training import in_one_step
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
 
 UPDATES = 20  # in a step
 SIZES = ((256, 256), (8, 8))  # samples of an update, width of the networks

@@ -12,23 +12,23 @@ from lerobot.configs.parser import (
 )
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_wm.pipeline.errors import exit_with_one_line
-from lerobot_wm.pipeline.remarks import drop_remarks
+from lerobot_wm.errors import exit_with_one_line
+from lerobot_wm.quiet import drop_remarks
 
 # name -> (module with a main() that reads sys.argv, what it does)
 COMMANDS: dict[str, tuple[str, str]] = {
-    "collect": ("lerobot_wm.pipeline.collect", "scripted-expert Meta-World demonstrations -> LeRobotDataset"),
-    "expert": ("lerobot_wm.pipeline.expert", "the scripted expert's rollouts, one record each"),
-    "relabel": ("lerobot_wm.pipeline.relabel", "copy of a dataset that is rewarded by another column"),
-    "init": ("lerobot_wm.pipeline.init", "checkpoint of an untrained world model or a frozen image backbone"),
-    "train": ("lerobot_wm.pipeline.train", "lerobot-train with its flags, fed from RAM or GPU memory"),
-    "encode": ("lerobot_wm.pipeline.encode", "image dataset + frozen world model -> latent LeRobotDataset"),
-    "eval": ("lerobot_wm.pipeline.evaluate", "lerobot-eval with its flags, one record per rollout"),
-    "report": ("lerobot_wm.report.build", "records -> success table and self-contained HTML page"),
-    "quality": ("lerobot_wm.report.quality", "how good a world model is on positions it was not trained on"),
-    "dream": ("lerobot_wm.pipeline.dream", "an episode as a world model imagines it: video and strip"),
-    "publish": ("lerobot_wm.pipeline.publish", "checkpoint -> the Hub, with results and a dream on its card"),
-    "doctor": ("lerobot_wm.pipeline.doctor", "check Python, GL, packages, GPU, disk and Hub login"),
+    "collect": ("lerobot_wm.collect.command", "scripted-expert Meta-World demonstrations -> LeRobotDataset"),
+    "expert": ("lerobot_wm.commands.expert", "the scripted expert's rollouts, one record each"),
+    "relabel": ("lerobot_wm.commands.relabel", "copy of a dataset that is rewarded by another column"),
+    "init": ("lerobot_wm.commands.init", "checkpoint of an untrained world model or a frozen image backbone"),
+    "train": ("lerobot_wm.train.command", "lerobot-train with its flags, fed from RAM or GPU memory"),
+    "encode": ("lerobot_wm.encode.command", "image dataset + frozen world model -> latent LeRobotDataset"),
+    "eval": ("lerobot_wm.evaluate.command", "lerobot-eval with its flags, one record per rollout"),
+    "report": ("lerobot_wm.report.command", "records -> success table and self-contained HTML page"),
+    "quality": ("lerobot_wm.inspect.quality", "how good a world model is on positions it was not trained on"),
+    "dream": ("lerobot_wm.inspect.dream_command", "an episode as a world model imagines it: video and strip"),
+    "publish": ("lerobot_wm.hub.publish", "checkpoint -> the Hub, with results and a dream on its card"),
+    "doctor": ("lerobot_wm.commands.doctor", "check Python, GL, packages, GPU, disk and Hub login"),
 }
 
 

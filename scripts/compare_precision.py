@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_wm.constants import TRAIN_LOG_NAME
+from lerobot_wm.records import Record, provenance, read_records
 from lerobot_wm.report.comparison import compare
-from lerobot_wm.report.provenance import provenance
-from lerobot_wm.report.records import Record, read_records
-from lerobot_wm.report.statistics import success_rate
+from lerobot_wm.statistics import success_rate
 
 MONITORED = {
     "wm_rssm": ("image_loss", "reward_loss", "kl"),

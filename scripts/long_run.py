@@ -25,7 +25,7 @@ import psutil
 from lerobot_wm.constants import MT6
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.envs.rendering import Renderer
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
 
 WARM_UP = 0.2  # of a run; imports, the allocator's pools, the first checkpoint
 MADE_ANEW = 240  # resets after which environments are closed and made again

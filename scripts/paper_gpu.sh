@@ -47,7 +47,7 @@ import json
 import sys
 from pathlib import Path
 
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
 
 preset, seconds, file = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
 if file.is_file():  # of a call that this one went on from

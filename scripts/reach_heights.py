@@ -11,8 +11,8 @@ from pathlib import Path
 
 from lerobot_wm.constants import REPORTED_VARIATION_SET, VARIATION_SETS
 from lerobot_wm.envs.variations import rand_vec
-from lerobot_wm.report.records import Record, read_records
-from lerobot_wm.report.statistics import in_split, success_rate
+from lerobot_wm.records import Record, read_records
+from lerobot_wm.statistics import in_split, success_rate
 
 TASK = "reach-v3"
 EDGES_CM = (5, 10, 15, 20, 25, 30)

@@ -27,7 +27,7 @@ from lerobot_wm.constants import (
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.nn.mlp import MLP
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
 
 TASK = "reach-v3"
 NOISES = (0.0, 0.3, 0.5)

@@ -27,7 +27,7 @@ from torch import Tensor
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.envs.tasks import task_description
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
 
 PENALTY = 1e-2  # of the ridge regression, per frame and for features of unit variance
 FRAMES = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 30), (30, 60))  # of an episode: from, to before

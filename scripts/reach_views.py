@@ -23,7 +23,7 @@ from sklearn.linear_model import LinearRegression
 from lerobot_wm.constants import IMAGE_SIZE, NUM_SEEN_VARIATIONS, NUM_VARIATIONS
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.variations import rand_vec
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
 
 TASK = "reach-v3"
 SUCCESS_RADIUS = 0.05  # metres, Meta-World's own

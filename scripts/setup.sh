@@ -82,7 +82,7 @@ install_packages() {
 }
 
 render_frame() {
-  MUJOCO_GL="${MUJOCO_GL:-egl}" .venv/bin/python -P lerobot_wm/pipeline/render_probe.py
+  MUJOCO_GL="${MUJOCO_GL:-egl}" .venv/bin/python -P lerobot_wm/commands/render_probe.py
 }
 
 install_gl() {

@@ -20,9 +20,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lerobot_wm.constants import ACTION_DIM, IMAGE_SIZE
 from lerobot_wm.nn.conv import ConvDecoder, ConvEncoder
-from lerobot_wm.pipeline.memory import keep_freed_memory
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
-from lerobot_wm.report.provenance import provenance
+from lerobot_wm.records import provenance
+from lerobot_wm.system import keep_freed_memory
 from lerobot_wm.world_model.config import RSSMConfig
 from lerobot_wm.world_model.model import WorldModel
 

@@ -10,8 +10,8 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 from torch import Tensor, nn
 
-from lerobot_wm.pipeline.accelerator import RamAccelerator, make_accelerator
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
+from lerobot_wm.train.accelerator import RamAccelerator, make_accelerator
 
 
 class Line(nn.Module):

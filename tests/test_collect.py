@@ -8,6 +8,8 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wm.collect.command import CollectConfig, collect
+from lerobot_wm.collect.shards import Shard, ShardRecord, write_shard
 from lerobot_wm.constants import (
     ACTION,
     CAMERA_NAME,
@@ -25,9 +27,7 @@ from lerobot_wm.data.schema import COLLECTION_RECORD, check_finite, metaworld_fe
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.envs.tasks import task_description, task_id
 from lerobot_wm.envs.variations import parse_variations, rand_vec
-from lerobot_wm.pipeline.collect import CollectConfig, collect
-from lerobot_wm.pipeline.collect_shards import Shard, ShardRecord, write_shard
-from lerobot_wm.pipeline.quiet import quiet
+from lerobot_wm.quiet import quiet
 
 TASKS = ("reach-v3", "window-close-v3")
 EPISODES = 3

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.pipeline.collect import CollectConfig, collect
+from lerobot_wm.collect.command import CollectConfig, collect
 
 ACT = (
     "--policy.type=act",

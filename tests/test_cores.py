@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_wm import cores
-from lerobot_wm.cores import usable_cores
+from lerobot_wm import system as cores
+from lerobot_wm.system import usable_cores
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not pin processes to cores")

@@ -10,7 +10,7 @@ import pytest
 from packaging.requirements import Requirement
 from rich.console import Console
 
-from lerobot_wm.pipeline import doctor
+from lerobot_wm.commands import doctor
 
 
 def test_command_reports_every_part_and_fits_the_terminal(tmp_path: Path) -> None:

@@ -23,13 +23,13 @@ from lerobot.scripts.lerobot_eval import eval_policy
 
 from lerobot_wm import cli
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from lerobot_wm.pipeline import rollouts
-from lerobot_wm.pipeline.eval_config import BatchedEvalConfig, EvaluateConfig, variation_of
-from lerobot_wm.pipeline.evaluate import evaluate
-from lerobot_wm.pipeline.rollouts import TaskRunner, training_seed
-from lerobot_wm.policies import checkpoint
+from lerobot_wm.evaluate import rollouts
+from lerobot_wm.evaluate.command import evaluate
+from lerobot_wm.evaluate.config import BatchedEvalConfig, EvaluateConfig, variation_of
+from lerobot_wm.evaluate.rollouts import TaskRunner, training_seed
+from lerobot_wm.policies.common import checkpoint
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
-from lerobot_wm.report.records import Record, read_records
+from lerobot_wm.records import Record, read_records
 
 IMAGE = PolicyFeature(FeatureType.VISUAL, (64, 64, 3))
 VECTOR = PolicyFeature(FeatureType.STATE, (4,))

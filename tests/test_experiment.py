@@ -10,12 +10,11 @@ from rich.console import Console
 
 from lerobot_wm.experiment.arms import ARMS, Arm
 from lerobot_wm.experiment.experiment import Experiment
-from lerobot_wm.experiment.lock import exclusive
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import load_preset
-from lerobot_wm.experiment.reproduce import main, show_failures
+from lerobot_wm.experiment.reproduce import exclusive, main, show_failures
 from lerobot_wm.experiment.stage import Stage
-from lerobot_wm.report.records import read_records
+from lerobot_wm.records import read_records
 
 # Writes the two rollouts of an arm: python -c ROLL_OUT FOLDER ARM SEED
 ROLL_OUT = """

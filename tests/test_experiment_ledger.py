@@ -7,7 +7,7 @@ import pytest
 
 from lerobot_wm.experiment.ledger import Ledger
 from lerobot_wm.experiment.preset import Preset, load_preset
-from lerobot_wm.report.records import Record, read_records, record_line
+from lerobot_wm.records import Record, read_records, record_line
 
 
 @pytest.fixture

@@ -12,22 +12,22 @@ import pytest
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from lerobot_wm.collect.command import CollectConfig
+from lerobot_wm.commands.expert import ExpertConfig
+from lerobot_wm.commands.init import InitConfig
+from lerobot_wm.commands.relabel import RelabelConfig
 from lerobot_wm.constants import MT6
+from lerobot_wm.encode.command import EncodeConfig
+from lerobot_wm.evaluate.config import EvaluateConfig
 from lerobot_wm.experiment.arms import ARMS, Arm
+from lerobot_wm.experiment.experiment import report_command
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import load_preset, select_runs
-from lerobot_wm.experiment.report import report_command
 from lerobot_wm.experiment.stage import Stage, in_order, unfinished
-from lerobot_wm.pipeline.collect import CollectConfig
-from lerobot_wm.pipeline.encode_config import EncodeConfig
-from lerobot_wm.pipeline.eval_config import EvaluateConfig
-from lerobot_wm.pipeline.expert import ExpertConfig
-from lerobot_wm.pipeline.init import InitConfig
-from lerobot_wm.pipeline.relabel import RelabelConfig
-from lerobot_wm.pipeline.share import parts_folder, shards_folder
-from lerobot_wm.report import arms as report_arms
-from lerobot_wm.report.build import ReportConfig
-from lerobot_wm.report.quality import QualityConfig
+from lerobot_wm.inspect.quality import QualityConfig
+from lerobot_wm.report import comparison as report_arms
+from lerobot_wm.report.command import ReportConfig
+from lerobot_wm.system import parts_folder, shards_folder
 
 CONFIGS: dict[str, Any] = {
     "collect": CollectConfig,

@@ -13,11 +13,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from lerobot_wm.experiment.lock import exclusive
-from lerobot_wm.experiment.progress import Progress
-from lerobot_wm.experiment.runner import Runner
+from lerobot_wm.experiment.reproduce import exclusive
+from lerobot_wm.experiment.runner import Progress, Runner, Times, minutes_left, ranks
 from lerobot_wm.experiment.stage import Stage, in_order, unfinished
-from lerobot_wm.experiment.times import Times, minutes_left, ranks
 
 WRITE = "import os, pathlib, sys; f = pathlib.Path(sys.argv[1]); f.mkdir(parents=True)"
 DONE = f"{WRITE}; (f / 'done').write_text(' '.join(sys.argv[2:]) + '|' + os.environ['OMP_NUM_THREADS'])"
@@ -200,11 +198,11 @@ RUN = """
 import signal, sys
 from pathlib import Path
 from rich.console import Console
-from lerobot_wm.experiment.progress import Progress
-from lerobot_wm.experiment.lock import exclusive
+from lerobot_wm.experiment.runner import Progress
+from lerobot_wm.experiment.reproduce import exclusive
 from lerobot_wm.experiment.runner import Runner
 from lerobot_wm.experiment.stage import Stage
-from lerobot_wm.experiment.times import Times
+from lerobot_wm.experiment.runner import Times
 for number in (signal.SIGINT, signal.SIGTERM):  # a shell lets its background jobs ignore SIGINT
     signal.signal(number, signal.default_int_handler)
 folder = Path(sys.argv[1])

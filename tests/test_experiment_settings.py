@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_wm.experiment.arms import ARMS
-from lerobot_wm.experiment.preset import Preset, load_preset
-from lerobot_wm.experiment.settings import check_settings
+from lerobot_wm.experiment.preset import Preset, check_settings, load_preset
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 
 from lerobot_wm.constants import MT6
 from lerobot_wm.experiment.arms import ARMS
-from lerobot_wm.report.records import read_records, record_line
+from lerobot_wm.records import read_records, record_line
 
 SCRIPT = Path("scripts") / "reproduce_table1.py"
 ROLLOUTS = 2 * len(MT6)  # of each arm in the preset `smoke`

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from metaworld.policies import SawyerDoorOpenV3Policy
 
+from lerobot_wm.commands.expert import ExpertConfig, roll_out_expert
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
-from lerobot_wm.pipeline.expert import ExpertConfig, roll_out_expert
-from lerobot_wm.report.records import Record, read_records
+from lerobot_wm.records import Record, read_records
 
 
 @pytest.fixture(scope="module")

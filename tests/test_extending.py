@@ -11,7 +11,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 
-from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.latent.policy import LatentPolicy
 from tests.documents import blocks, commands, with_flags
 from tests.flags import TRAIN_FLAGS
 from tests.recording import FRONT, WRIST, camera, record, vector

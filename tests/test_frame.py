@@ -19,20 +19,24 @@ PACKAGE = ROOT / "lerobot_wm"
 
 # A part imports only parts of a lower level; parts of one level do not import each other.
 LEVELS = {
-    "constants": 0,
-    "cores": 0,
-    "files": 0,
-    "nn": 1,
-    "world_model": 2,
-    "rl": 2,
-    "data": 3,
-    "envs": 3,
-    "hub": 4,
-    "policies": 5,
-    "report": 6,
-    "pipeline": 7,
-    "experiment": 8,
-    "cli": 9,
+    name: level
+    for level, names in enumerate(
+        (
+            ("constants", "files", "system"),
+            ("records", "statistics", "tables", "errors", "workers", "quiet", "nn"),
+            ("world_model", "rl"),
+            ("data", "envs"),
+            ("policies",),
+            ("collect", "train", "encode", "evaluate"),
+            ("inspect",),
+            ("report",),
+            ("hub",),
+            ("commands",),
+            ("experiment",),
+            ("cli",),
+        )
+    )
+    for name in names
 }
 # Usable in any torch program: these know neither LeRobot nor a simulator.
 TORCH_ONLY = ("nn", "world_model", "rl")
@@ -155,10 +159,10 @@ def test_wheel_holds_modules_data_and_license(tmp_path: Path) -> None:
         "lerobot_wm/hub/demonstrations.md.j2",
         "lerobot_wm/hub/latents.md.j2",
         "lerobot_wm/hub/model_card.md.j2",
-        "lerobot_wm/report/page.html.j2",
-        "lerobot_wm/report/page.css",
-        "lerobot_wm/report/data_section.html.j2",
-        "lerobot_wm/report/quality_section.html.j2",
+        "lerobot_wm/report/templates/page.html.j2",
+        "lerobot_wm/report/templates/page.css",
+        "lerobot_wm/report/templates/data_section.html.j2",
+        "lerobot_wm/report/templates/quality_section.html.j2",
         "lerobot_policy_wm.py",
     }
     assert data <= names

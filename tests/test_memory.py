@@ -8,14 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from lerobot_wm.pipeline.memory import keep_freed_memory
+from lerobot_wm.system import keep_freed_memory
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator")
 
 # The block's size is above the largest that glibc keeps by itself, 32 MiB.
 FREE_A_BLOCK = """
 import numpy as np, psutil
-from lerobot_wm.pipeline.memory import keep_freed_memory
+from lerobot_wm.system import keep_freed_memory
 keep_freed_memory()
 block = np.ones(64 << 20, dtype=np.uint8)
 full = psutil.Process().memory_info().rss

@@ -18,8 +18,8 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from safetensors.torch import load_file
 
-from lerobot_wm.policies.iql_agent import Outcomes
-from lerobot_wm.policies.rewards import FrameLabel
+from lerobot_wm.policies.common.iql_agent import Outcomes
+from lerobot_wm.policies.common.rewards import FrameLabel
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import SMALL_WORLD_MODEL
 from tests.recording import FRONT, camera, record, train_flags, vector

@@ -12,9 +12,9 @@ import torch
 from lerobot.datasets.dataset_tools import add_features, modify_features
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.data.fingerprint import dataset_fingerprint
-from lerobot_wm.data.lock import sole_writer
-from lerobot_wm.pipeline.relabel import relabel
+from lerobot_wm.commands.relabel import relabel
+from lerobot_wm.data.latents import dataset_fingerprint
+from lerobot_wm.files import sole_writer
 from tests.flags import DATASET_FLAGS
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lerobot_wm.envs.tasks import resolve_tasks
-from lerobot_wm.report.build import ReportConfig, report
-from lerobot_wm.report.records import Record, read_records
-from lerobot_wm.report.statistics import in_split, success_rate
+from lerobot_wm.records import Record, read_records
+from lerobot_wm.report.command import ReportConfig, report
+from lerobot_wm.statistics import in_split, success_rate
 
 ROOT = Path(__file__).resolve().parents[1]
 RATE_BEFORE = ROOT / "results" / "cpu" / "constant_rate"  # float32 was compared with these rollouts

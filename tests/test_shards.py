@@ -13,16 +13,16 @@ from lerobot.datasets import feature_utils
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wm.collect.command import CollectConfig, collect
+from lerobot_wm.collect.merge import merge_datasets
+from lerobot_wm.collect.shards import SHARD_RECORD
 from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
-from lerobot_wm.pipeline.collect import CollectConfig, collect
-from lerobot_wm.pipeline.collect_record import SHARD_RECORD
-from lerobot_wm.pipeline.encode import encode, encode_share
-from lerobot_wm.pipeline.encode_episodes import episode_batches, filter_batches
-from lerobot_wm.pipeline.merge import merge_datasets
-from lerobot_wm.pipeline.quiet import quiet
-from lerobot_wm.pipeline.share import Share
-from lerobot_wm.policies.frozen_encoder import load_encoder
+from lerobot_wm.encode.command import encode, encode_share
+from lerobot_wm.encode.episodes import episode_batches, filter_batches
+from lerobot_wm.policies.latent.encoder import load_encoder
+from lerobot_wm.quiet import quiet
+from lerobot_wm.system import Share
 
 SHARDS = ("reach-v3-00000", "window-close-v3-00000")
 
@@ -290,8 +290,8 @@ def test_a_push_of_other_samples_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pushed = []
-    monkeypatch.setattr("lerobot_wm.pipeline.encode.check_can_push", lambda repo_id: None)
-    monkeypatch.setattr("lerobot_wm.pipeline.encode.push_latents", lambda *args: pushed.append(args[1]))
+    monkeypatch.setattr("lerobot_wm.encode.command.check_can_push", lambda repo_id: None)
+    monkeypatch.setattr("lerobot_wm.encode.command.push_latents", lambda *args: pushed.append(args[1]))
 
     def push(*flags: str) -> None:
         lerobot_wm_command(

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from lerobot_wm.pipeline.workers import interrupts_held
+from lerobot_wm.workers import interrupts_held
 
 
 def interrupted(finished: list[bool]) -> None:

@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from torch.utils.data import DataLoader
 
 from lerobot_wm.data.loader import RamLoader
-from lerobot_wm.policies.cameras import camera_images
+from lerobot_wm.policies.common.cameras import camera_images
 from lerobot_wm.policies.e2e_bc.modeling_e2e_bc import E2EBCPolicy
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from lerobot.utils.import_utils import get_safe_default_video_backend
 
-from lerobot_wm.pipeline.remarks import drop_remarks
+from lerobot_wm.quiet import drop_remarks
 from tests.flags import DATASET_FLAGS
 
 COLUMNS = 100

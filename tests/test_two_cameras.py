@@ -11,9 +11,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader
 
 from lerobot_wm.data.loader import RamLoader
-from lerobot_wm.hub.source import SourceConfig
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.open_loop import CONTEXT, load_world_model, open_loop, strips_figure
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
-from lerobot_wm.report.open_loop import CONTEXT, load_world_model, open_loop, strips_figure
 from tests.flags import TRAIN_FLAGS
 
 Command = Callable[..., None]
@@ -139,7 +139,7 @@ def test_latents_of_other_cameras_never_mix(
     lerobot_wm_command: Command,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("lerobot_wm.pipeline.encode.check_can_push", lambda repo_id: None)
+    monkeypatch.setattr("lerobot_wm.encode.command.check_can_push", lambda repo_id: None)
     # The same weights shown the cameras in another order.
     other = shutil.copytree(world_model_path, tmp_path / "other")
     config = json.loads((other / "config.json").read_text())

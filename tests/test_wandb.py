@@ -11,8 +11,8 @@ from lerobot.configs.default import WandBConfig
 from wandb.proto.wandb_internal_pb2 import Record
 from wandb.sdk.internal.datastore import DataStore
 
-from lerobot_wm.pipeline.wandb_log import wandb_run
-from lerobot_wm.policies.checkpoint import split_revision
+from lerobot_wm.evaluate.wandb_log import wandb_run
+from lerobot_wm.policies.common.checkpoint import split_revision
 from tests.flags import DATASET_FLAGS, SMALL_WORLD_MODEL, TRAIN_FLAGS
 
 

@@ -11,8 +11,7 @@ from torch.utils.data import BatchSampler, DataLoader
 from benchmarks.data import REPO_ID, demonstrations, latents
 from benchmarks.timing import Prepared, rate
 from lerobot_wm.constants import ACTION, FPS, OBS_IMAGE, OBS_LATENT, OBS_STATE, REWARD
-from lerobot_wm.data.loader import RamLoader
-from lerobot_wm.data.order import EpochOrder
+from lerobot_wm.data.loader import EpochOrder, RamLoader
 
 CPU = torch.device("cpu")
 

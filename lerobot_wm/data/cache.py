@@ -18,12 +18,11 @@ from numpy.lib.format import open_memmap
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wm.cores import usable_cores
-from lerobot_wm.data.check_info import MEND, one_line
-from lerobot_wm.data.errors import DatasetError
-from lerobot_wm.data.fingerprint import dataset_fingerprint
-from lerobot_wm.data.folder import is_snapshot
-from lerobot_wm.data.resize import resize_images
+from lerobot_wm.data.check_meta import MEND, one_line
+from lerobot_wm.data.latents import dataset_fingerprint
+from lerobot_wm.data.source import DatasetError, is_snapshot
+from lerobot_wm.nn.images import resize_images
+from lerobot_wm.system import usable_cores
 
 logger = logging.getLogger(__name__)
 

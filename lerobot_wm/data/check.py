@@ -11,13 +11,16 @@ from pathlib import Path
 from datasets.exceptions import DatasetGenerationError
 from huggingface_hub.utils import validate_repo_id
 
-from lerobot_wm.data.check_episodes import check_tasks, read_episodes
-from lerobot_wm.data.check_frames import check_contents, check_frames
-from lerobot_wm.data.check_info import read_info
-from lerobot_wm.data.check_stats import check_stats
-from lerobot_wm.data.check_videos import check_video_file, check_video_times
-from lerobot_wm.data.errors import DatasetError
-from lerobot_wm.data.folder import dataset_folder, is_snapshot
+from lerobot_wm.data.check_files import (
+    check_contents,
+    check_frames,
+    check_tasks,
+    check_video_file,
+    check_video_times,
+    read_episodes,
+)
+from lerobot_wm.data.check_meta import check_stats, read_info
+from lerobot_wm.data.source import DatasetError, dataset_folder, is_snapshot
 
 
 def check_dataset(repo_id: str, root: str | Path | None = None, revision: str | None = None) -> None:

@@ -22,10 +22,10 @@ from lerobot_wm.constants import (
     REPORTED_VARIATION_SET,
     STATE_DIM,
 )
-from lerobot_wm.cores import usable_cores
 from lerobot_wm.envs.cameras import image_features, parse_cameras
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import split_variations
+from lerobot_wm.system import usable_cores
 
 
 @EnvConfig.register_subclass(ENV_TYPE)

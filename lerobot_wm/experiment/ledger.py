@@ -4,7 +4,7 @@ from pathlib import Path
 
 from lerobot_wm.experiment.preset import Preset
 from lerobot_wm.files import write_whole
-from lerobot_wm.report.records import Record, read_records, record_line
+from lerobot_wm.records import Record, read_records, record_line
 
 type Runs = dict[tuple[str, int | None], list[Record]]  # by (arm, seed)
 

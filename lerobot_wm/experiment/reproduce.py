@@ -1,21 +1,43 @@
 """`scripts/reproduce_table1.py`: any arms and seeds of the experiment, from nothing to the table."""
 
 import argparse
+import fcntl
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from rich.console import Console
 
 from lerobot_wm.constants import REPORTED_VARIATION_SET, VARIATION_SETS
-from lerobot_wm.cores import usable_cores
 from lerobot_wm.experiment.arms import ARMS
 from lerobot_wm.experiment.experiment import Experiment
-from lerobot_wm.experiment.lock import exclusive
 from lerobot_wm.experiment.plan import Plan
-from lerobot_wm.experiment.preset import load_preset, select_runs
-from lerobot_wm.experiment.settings import check_settings
+from lerobot_wm.experiment.preset import check_settings, load_preset, select_runs
 from lerobot_wm.experiment.stage import Stage
+from lerobot_wm.system import usable_cores
+
+
+@contextmanager
+def exclusive(output_dir: Path) -> Iterator[IO]:
+    """Hold a folder's lock, which its running stages hold too.
+
+    Raises:
+        BlockingIOError: another run, or a stage that a killed run left behind, is at work there.
+    """
+    output_dir.mkdir(parents=True, exist_ok=True)
+    with (output_dir / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BlockingIOError(
+                f"Another run, or a stage that a killed run left behind, is at work in {output_dir}: wait until it "
+                "has ended, end it, or give another --output_dir."
+            ) from error
+        yield lock
+
 
 LOG_TAIL = 15  # lines of a failed stage's log that are shown
 

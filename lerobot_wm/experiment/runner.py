@@ -1,15 +1,215 @@
 """Running stages side by side: in the order of what waits for them, within the machine's cores."""
 
+import json
+import os
+import shlex
 import signal
+import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import IO
 
-from lerobot_wm.experiment.process import Running, stop
-from lerobot_wm.experiment.progress import Progress
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
 from lerobot_wm.experiment.stage import Stage
-from lerobot_wm.experiment.times import Times, ranks
-from lerobot_wm.pipeline.signals import held_back
+from lerobot_wm.files import write_whole
+from lerobot_wm.system import held_back
+
+
+class Times:
+    """`times.json`: {stage: {"kind", "seconds"}} for every stage that ended well.
+
+    Args:
+        path: The file.
+        expected: Minutes of each kind of stage, until one of them has been measured.
+    """
+
+    def __init__(self, path: Path, expected: Mapping[str, float]) -> None:
+        self._path = path
+        self._expected = expected
+        self._measured: dict[str, dict] = json.loads(path.read_text()) if path.is_file() else {}
+
+    def note(self, stage: Stage, seconds: float) -> None:
+        """Add a finished stage, measured from its start: not one that went on from a checkpoint."""
+        self._measured[stage.name] = {"kind": stage.kind, "seconds": round(seconds, 1)}
+        write_whole(self._path, json.dumps(self._measured, indent=1) + "\n")
+
+    def minutes(self, kind: str) -> float:
+        """How long a stage of this kind takes: the mean of those measured, else what the preset states.
+
+        Raises:
+            ValueError: none was measured and the preset does not say.
+        """
+        seconds = [entry["seconds"] for entry in self._measured.values() if entry["kind"] == kind]
+        if seconds:
+            return sum(seconds) / len(seconds) / 60
+        if kind not in self._expected:
+            raise ValueError(f"The preset's experiment.json states no minutes for '{kind}'; add them there.")
+        return self._expected[kind]
+
+
+def ranks(stages: Mapping[str, Stage], minutes: Mapping[str, float]) -> dict[str, float]:
+    """Minutes from the start of each stage to the end of the longest chain of stages that wait for it.
+
+    Args:
+        stages: In an order in which each comes after those it needs.
+        minutes: Of each of them.
+
+    Returns:
+        The upward rank of list scheduling (Topcuoglu et al. 2002): the highest is to be started first.
+    """
+    after = dict.fromkeys(stages, 0.0)
+    for name in reversed(list(stages)):  # those that wait for a stage come before it
+        for need in stages[name].needs:
+            if need.name in after:
+                after[need.name] = max(after[need.name], minutes[name] + after[name])
+    return {name: minutes[name] + after[name] for name in stages}
+
+
+def minutes_left(stages: Mapping[str, Stage], minutes: Mapping[str, float], processes: int) -> float:
+    """A lower bound of the minutes `processes` side by side need: the longest chain, or their share of the sum."""
+    longest = max(ranks(stages, minutes).values(), default=0.0)
+    return max(longest, sum(minutes[name] for name in stages) / processes)
+
+
+STOP_SECONDS = 20.0  # from being asked to end until being made to
+
+
+class Running:
+    """Starts a stage.
+
+    Args:
+        stage: What to run.
+        cores: How many cores it may use.
+        lock: Held open by the subprocess too: a lock on it lasts until the last stage has ended, also where
+            this process was killed.
+    """
+
+    def __init__(self, stage: Stage, cores: int, lock: IO) -> None:
+        self.stage = stage
+        self.resumed = stage.resumes  # from a checkpoint: its time is that of a part
+        self._started = time.monotonic()
+        command = stage.command(cores)
+        stage.prepare()
+        with stage.log.open("a") as log:
+            print("$", shlex.join(command), file=log, flush=True)
+            # In a process group of its own: Ctrl-C reaches this process alone, which then ends the group.
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment(cores),
+                process_group=0,
+                pass_fds=(lock.fileno(),),
+            )
+
+    @property
+    def returncode(self) -> int | None:
+        """None while it runs."""
+        return self._process.poll()
+
+    @property
+    def seconds(self) -> float:
+        """Since its start."""
+        return time.monotonic() - self._started
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal to all its processes."""
+        if self.returncode is None:
+            os.killpg(self._process.pid, number)
+
+    def wait(self, seconds: float | None = None) -> None:
+        """Wait for its end.
+
+        Raises:
+            subprocess.TimeoutExpired: it runs on.
+        """
+        self._process.wait(seconds)
+
+
+def stop(running: Sequence[Running]) -> None:
+    """End stages: all are asked at once, and made to after a while."""
+    for work in running:
+        work.signal(signal.SIGTERM)
+    end = time.monotonic() + STOP_SECONDS
+    for work in running:
+        try:
+            work.wait(max(0.0, end - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            work.signal(signal.SIGKILL)
+            work.wait()
+
+
+def environment(cores: int) -> dict[str, str]:
+    """A stage's environment: its share of the cores, headless rendering, nothing fetched from the Hub."""
+    variables = {"HF_HUB_OFFLINE": "1", "MUJOCO_GL": "egl", **os.environ, "OMP_NUM_THREADS": str(cores)}
+    # Without bytecode files, which this variable forbids, each command spends seconds more on its imports.
+    variables.pop("PYTHONDONTWRITEBYTECODE", None)
+    return variables
+
+
+class Progress:
+    """Lines for what starts and ends, and on a terminal a live view below them. A context manager."""
+
+    def __init__(self, console: Console, times: Times, processes: int, total: int) -> None:
+        self._console = console
+        self._times = times
+        self._processes = processes
+        self._total = total
+        self._done = 0
+        self._live = Live(console=console, refresh_per_second=2, transient=True)
+
+    def __enter__(self) -> "Progress":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._live.stop()
+
+    def started(self, stage: Stage) -> None:
+        """Say that a stage starts, or where it goes on."""
+        how = "goes on" if stage.resumes else "starts"
+        self._console.print(f"{stage.name} {how}; log: {stage.log}", highlight=False, soft_wrap=True)
+
+    def finished(self, stage: Stage, seconds: float) -> None:
+        """Say that a stage ended well."""
+        self._done += 1
+        self._console.print(
+            f"[green]{stage.name} done[/] in {minutes_text(seconds / 60)} ({self._done}/{self._total})",
+            highlight=False,
+        )
+
+    def failed(self, stage: Stage, returncode: int) -> None:
+        """Say that a stage failed."""
+        why = f"exit code {returncode}" if returncode else f"it ended without writing {stage.artefact}"
+        self._console.print(f"[red]{stage.name} failed[/] ({why})", highlight=False, soft_wrap=True)
+
+    def show(self, running: Sequence[Running], waiting: Mapping[str, Stage]) -> None:
+        """Renew the live view."""
+        minutes = {name: self._times.minutes(stage.kind) for name, stage in waiting.items()}
+        table = Table("running", "minutes", "of about", box=None)
+        for work in running:
+            expected, spent = self._times.minutes(work.stage.kind), work.seconds / 60
+            table.add_row(work.stage.name, f"{spent:.1f}", f"{expected:.1f}")
+            minutes[work.stage.name] = max(0.0, expected - spent)
+        stages = {work.stage.name: work.stage for work in running} | dict(waiting)
+        left = minutes_left(stages, minutes, self._processes)
+        state = (
+            f"{self._done} of {self._total} stages done, {len(waiting)} wait; about {minutes_text(left)} left"
+        )
+        self._live.update(Group(table, Text(state)))
+
+
+def minutes_text(minutes: float) -> str:
+    """3.2 -> "3.2 min", 72 -> "1 h 12 min"."""
+    return f"{minutes:.1f} min" if minutes < 60 else f"{minutes // 60:.0f} h {minutes % 60:.0f} min"
+
 
 POLL_SECONDS = 0.2
 

@@ -7,8 +7,7 @@ from huggingface_hub import DatasetCard
 from huggingface_hub.constants import ENDPOINT
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.data.fingerprint import dataset_fingerprint
-from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.hub.markdown import Markdown, render
 

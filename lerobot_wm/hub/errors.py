@@ -19,7 +19,7 @@ from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
 from lerobot.datasets.utils import get_repo_versions, is_valid_version
 from packaging.version import Version
 
-from lerobot_wm.data.folder import dataset_folder, is_snapshot
+from lerobot_wm.data.source import dataset_folder, is_snapshot
 
 LOGIN = "log in with `hf auth login`, or set HF_TOKEN"
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from lerobot_wm.nn.dropout import Dropout
+from lerobot_wm.nn.fast_cpu import Dropout
 
 
 class MLP(nn.Module):

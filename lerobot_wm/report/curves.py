@@ -8,7 +8,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from lerobot_wm.constants import TRAIN_LOG_NAME
-from lerobot_wm.report.inline import short
+from lerobot_wm.inspect.html import short
 
 # LeRobot's counters and timings, which say nothing about learning.
 BOOKKEEPING = {

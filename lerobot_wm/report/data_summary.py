@@ -14,11 +14,11 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.cache import frame_shape
+from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.schema import COLLECTION_RECORD
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.policies.rewards import reward_columns
-from lerobot_wm.report.episodes import episodes_by_task
-from lerobot_wm.report.inline import WEBP, data_uri
+from lerobot_wm.inspect.episodes import episodes_by_task
+from lerobot_wm.inspect.html import WEBP, data_uri
+from lerobot_wm.policies.common.rewards import reward_columns
 
 PICTURE_SIZE = 256  # pixels that a picture is at most wide and high
 

@@ -2,17 +2,15 @@
 
 from dataclasses import dataclass, field
 
-from lerobot_wm.report.arms import ARMS, by_arm
-from lerobot_wm.report.bootstrap import Estimate
+from matplotlib.figure import Figure
+
+from lerobot_wm.inspect.dream_figures import DreamClip
+from lerobot_wm.inspect.html import SVG, data_uri, figure_bytes, short, template_environment
+from lerobot_wm.inspect.latent_map import LatentMap
+from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, OpenLoop
+from lerobot_wm.records import Record, by_task
+from lerobot_wm.report.comparison import ARMS, by_arm
 from lerobot_wm.report.data_summary import DataSummary
-from lerobot_wm.report.dream_clips import DreamClip
-from lerobot_wm.report.inline import SVG, data_uri, figure_bytes
-from lerobot_wm.report.latents import LatentMap
-from lerobot_wm.report.open_loop import CONTEXT, HORIZONS, OpenLoop
-from lerobot_wm.report.outcomes import OutcomeGrid, outcome_grids
-from lerobot_wm.report.records import Record
-from lerobot_wm.report.split_figure import split_figure
-from lerobot_wm.report.statistics import SuccessRate, in_split
 from lerobot_wm.report.success import (
     comparison_tables,
     overall_table,
@@ -20,9 +18,89 @@ from lerobot_wm.report.success import (
     seed_table,
     task_table,
 )
-from lerobot_wm.report.tables import ReportTable, cell_text, present_splits
-from lerobot_wm.report.templates import template_environment
 from lerobot_wm.report.videos import MAX_VIDEO_BYTES, Clip, within_limit
+from lerobot_wm.statistics import Estimate, SuccessRate, in_split, success_rate
+from lerobot_wm.tables import ReportTable, cell_text, present_splits
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The rollouts of one arm on one variation, one per training seed."""
+
+    successes: int
+    n: int
+    clip: Clip | None
+
+    @property
+    def kind(self) -> str:
+        """ "success" or "failure" of all, or "mixed"."""
+        if self.successes == self.n:
+            return "success"
+        return "mixed" if self.successes else "failure"
+
+
+@dataclass(frozen=True)
+class OutcomeGrid:
+    """One task: a row of outcomes per arm, None where a variation was not rolled out."""
+
+    task: str
+    variations: list[int]
+    n_seen: int  # how many of the variations, the first ones, occur in the training data
+    rows: list[tuple[str, list[Outcome | None]]]
+
+
+def outcome_grids(records: list[Record], clips: list[Clip]) -> list[OutcomeGrid]:
+    """A grid for each task; of several videos of a cell the first is shown."""
+    videos: dict[tuple[str, str, int], Clip] = {}
+    for clip in clips:
+        videos.setdefault((clip.arm, clip.task, clip.variation), clip)
+    grids = []
+    for task, of_task in by_task(records).items():
+        seen = {record["variation"] for record in of_task if record["seen"]}
+        others = {record["variation"] for record in of_task} - seen
+        variations = [*sorted(seen), *sorted(others)]
+        rows: list[tuple[str, list[Outcome | None]]] = []
+        for arm, of_arm in by_arm(of_task).items():
+            results: dict[int, list[bool]] = {}
+            for record in of_arm:
+                results.setdefault(record["variation"], []).append(record["success"])
+            cells = [
+                Outcome(sum(results[v]), len(results[v]), videos.get((arm, task, v)))
+                if v in results
+                else None
+                for v in variations
+            ]
+            rows.append((arm, cells))
+        grids.append(OutcomeGrid(task, variations, len(seen), rows))
+    return grids
+
+
+COLOURS = {"seen": "#e08214", "unseen": "#2f6fde"}
+
+
+def split_figure(records: list[Record]) -> Figure:
+    """Success over all tasks with Wilson 95% intervals, on seen and on unseen variations.
+
+    Records without the notion of seen variations (`seen` None) are not drawn.
+    """
+    arms = by_arm(records)
+    figure = Figure(figsize=(5.6, 1.1 + 0.34 * len(arms)), layout="constrained")
+    axes = figure.subplots()
+    for (split, colour), shift in zip(COLOURS.items(), (-0.14, 0.14), strict=True):
+        for row, of_arm in enumerate(arms.values()):
+            rate = success_rate(r for r in of_arm if in_split(r, split))
+            if rate is not None:
+                axes.plot(rate.interval, [row + shift] * 2, color=colour, linewidth=2, alpha=0.5)
+                axes.plot(rate.percent, row + shift, "o", color=colour, markersize=6, clip_on=False)
+        axes.plot([], [], "o-", color=colour, label=split)
+    axes.set_yticks(range(len(arms)), [short(arm) for arm in arms])
+    axes.set_ylim(len(arms) - 0.5, -0.5)  # first arm on top; whole rows, whatever is drawn in them
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("success, % of rollouts over all tasks")
+    axes.grid(axis="x", alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside upper right", ncols=2, frameon=False)
+    return figure
 
 
 @dataclass

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_wm.constants import EVAL_INFO_NAME
-from lerobot_wm.report.inline import MP4, data_uri
+from lerobot_wm.inspect.html import MP4, data_uri
 
 # All videos of the grid together; as data URIs they take a third more. 500 steps at 256x256 take 150 kB.
 MAX_VIDEO_BYTES = 12_000_000

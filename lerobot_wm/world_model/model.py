@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_wm.nn.augment import random_crop
 from lerobot_wm.nn.conv import EMBED_DIM, ConvDecoder, ConvEncoder
+from lerobot_wm.nn.images import random_crop
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.world_model.config import RSSMConfig

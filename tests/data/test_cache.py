@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_wm.data.cache import CameraCache, cache_root, camera_frames
-from lerobot_wm.data.lock import sole_writer
+from lerobot_wm.files import sole_writer
 from tests.recording import FRONT, camera, record, vector
 
 PROCESSES, ROUNDS = 4, 25

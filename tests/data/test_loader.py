@@ -14,7 +14,7 @@ from lerobot.datasets.video_utils import decode_video_frames
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_wm.data.cache import CACHE_VARIABLE, camera_frames
-from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.data.loader import RamDataset, RamLoader, gather
 
 CPU = torch.device("cpu")

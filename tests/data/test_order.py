@@ -5,7 +5,7 @@ import torch
 from lerobot.datasets.sampler import EpisodeAwareSampler
 from torch.utils.data import DataLoader, TensorDataset
 
-from lerobot_wm.data.order import EpochOrder, batches_of_rows
+from lerobot_wm.data.loader import EpochOrder, batches_of_rows
 
 
 def sampler(shuffle: bool = True) -> EpisodeAwareSampler:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from lerobot_wm.data.resize import resize_images
+from lerobot_wm.nn.images import resize_images
 
 
 def camera_image(height: int, width: int, count: int = 1) -> torch.Tensor:

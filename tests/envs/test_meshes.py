@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lerobot_wm.envs import rendering
-from lerobot_wm.envs.meshes import _nearest_to_means, _proper, simplify_robot
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
+from lerobot_wm.envs.rendering import _nearest_to_means, _proper, simplify_robot
 from lerobot_wm.envs.simulation import Simulation
 
 CELL = 0.004

@@ -107,9 +107,9 @@ def _run_watched(arguments: str, folder: str, kill_at: int | None, notes: str) -
 
 def _serve(notes: str) -> None:
     # What takes seconds to import; no import starts a thread, which a fork would not take along.
-    import lerobot_wm.pipeline.encode
-    import lerobot_wm.pipeline.evaluate
-    import lerobot_wm.pipeline.train  # noqa: F401
+    import lerobot_wm.encode.command
+    import lerobot_wm.evaluate.command
+    import lerobot_wm.train.command  # noqa: F401
 
     for line in sys.stdin:
         arguments, folder, kill_at = json.loads(line)

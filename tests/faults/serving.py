@@ -9,10 +9,10 @@ import sys
 def serve() -> None:
     """Fork for each request to run a command, and answer with its process; tell the exit code of one waited for."""
     # What takes seconds to import; no import starts a thread, which a fork would not take along.
-    import lerobot_wm.pipeline.collect
-    import lerobot_wm.pipeline.encode
-    import lerobot_wm.pipeline.evaluate
-    import lerobot_wm.pipeline.train  # noqa: F401
+    import lerobot_wm.collect.command
+    import lerobot_wm.encode.command
+    import lerobot_wm.evaluate.command
+    import lerobot_wm.train.command  # noqa: F401
     from lerobot_wm import cli
 
     for line in sys.stdin:

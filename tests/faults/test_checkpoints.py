@@ -10,8 +10,8 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OPTIMIZER_STATE, RNG_STATE, TRAINING_STEP
 
+from lerobot_wm.encode.command import encode
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from lerobot_wm.pipeline.encode import encode
 from tests.faults.breakage import Fault, cut, remove, set_entry, write
 from tests.faults.checkpoints import (
     CONFIG,

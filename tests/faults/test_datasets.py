@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wm.collect.merge import merge_datasets
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.check import check_dataset
-from lerobot_wm.data.errors import DatasetError
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.pipeline.merge import merge_datasets
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import DatasetError
 from tests.documents import ROOT
 from tests.faults.breakage import DATA, FAULTS, STATS, VIDEO, damage, remove
 from tests.faults.conftest import WIDE

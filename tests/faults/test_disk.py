@@ -13,9 +13,9 @@ from lerobot.utils.io_utils import load_json
 
 from lerobot_wm.data.cache import CACHE_VARIABLE, camera_frames
 from lerobot_wm.data.check import check_dataset
-from lerobot_wm.data.lock import sole_writer
-from lerobot_wm.pipeline.errors import disk_problem
-from lerobot_wm.report.records import read_records
+from lerobot_wm.errors import disk_problem
+from lerobot_wm.files import sole_writer
+from lerobot_wm.records import read_records
 from tests.faults.conftest import WIDE
 from tests.faults.running import Commands, Inputs, remount, small_disk, wait_until
 

@@ -17,8 +17,8 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.data.check import check_dataset
-from lerobot_wm.data.errors import DatasetError
-from lerobot_wm.pipeline.errors import exit_with_one_line
+from lerobot_wm.data.source import DatasetError
+from lerobot_wm.errors import exit_with_one_line
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from tests.faults.breakage import EPISODES, INFO, STATS, TASKS

@@ -6,7 +6,7 @@ import pytest
 from lerobot.utils.io_utils import load_json
 
 from lerobot_wm.data.check import check_dataset
-from lerobot_wm.report.records import read_records
+from lerobot_wm.records import read_records
 from tests.faults.running import Commands, Ended, Inputs
 
 AGAIN = "interrupted; the same command goes on where it was, or begins again."

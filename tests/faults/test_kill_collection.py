@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wm.collect.command import CollectConfig, collect, plan_shards
+from lerobot_wm.collect.shards import SHARD_RECORD, TEMPORARY_PREFIX
 from lerobot_wm.data.schema import COLLECTION_RECORD
-from lerobot_wm.pipeline.collect import CollectConfig, collect, plan_shards
-from lerobot_wm.pipeline.collect_shards import SHARD_RECORD, TEMPORARY_PREFIX
 from tests.faults.killing import WatchedCommands, digests
 from tests.faults.running import processes_of, wait_until
 

@@ -12,10 +12,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.latents import RECORD_PATH
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.encode.command import encode
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.pipeline.encode import encode
-from lerobot_wm.pipeline.publish import CheckpointFolder, PublishConfig, publish
+from lerobot_wm.hub.publish import CheckpointFolder, PublishConfig, publish
 from tests.faults.breakage import set_entry
 from tests.faults.checkpoints import TASKS, WEIGHTS, last_line, load, make_checkpoint, record_demos
 from tests.flags import TRAIN_FLAGS

@@ -11,15 +11,15 @@ from huggingface_hub.errors import HFValidationError
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wm.collect.config import CollectConfig
+from lerobot_wm.commands.relabel import relabel
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.check import check_dataset
 from lerobot_wm.data.loader import RamDataset
-from lerobot_wm.pipeline.collect_config import CollectConfig
-from lerobot_wm.pipeline.processors import check_processors
-from lerobot_wm.pipeline.relabel import relabel
+from lerobot_wm.policies.common.checkpoint import check_processors
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
-from lerobot_wm.report.build import ReportConfig, report
-from lerobot_wm.report.records import record_line
+from lerobot_wm.records import record_line
+from lerobot_wm.report.command import ReportConfig, report
 from tests.faults.breakage import INFO, ONE_NUMBER, set_entry
 from tests.faults.conftest import WIDE, write_dataset
 

@@ -13,13 +13,13 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import nn
 from torch.utils.data import DataLoader
 
-from lerobot_wm.data.errors import DatasetError
+from lerobot_wm.collect.shards import Shard, write_shard
 from lerobot_wm.data.loader import RamDataset, RamLoader
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import DatasetError
 from lerobot_wm.envs.simulation import Simulation
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.pipeline.collect_shards import Shard, write_shard
-from lerobot_wm.pipeline.divergence import DivergenceError, LossWatch
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from lerobot_wm.train.accelerator import DivergenceError, LossWatch
 from tests.faults.breakage import DATA, set_value
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
 

@@ -14,10 +14,10 @@ from lerobot.datasets.io_utils import load_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
+from lerobot_wm.collect.merge import merge_datasets
 from lerobot_wm.data.check import check_dataset
 from lerobot_wm.data.loader import RamDataset, gather
-from lerobot_wm.pipeline.merge import merge_datasets
-from lerobot_wm.pipeline.share import Share
+from lerobot_wm.system import Share
 from tests.recording import record, vector
 
 SETTINGS: dict[str, Any] = {"deadline": None, "database": None, "derandomize": True}

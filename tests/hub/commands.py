@@ -14,11 +14,11 @@ import httpx
 import torch
 from huggingface_hub import constants, set_client_factory
 
-import lerobot_wm.pipeline.collect
-import lerobot_wm.pipeline.encode
-import lerobot_wm.pipeline.evaluate
-import lerobot_wm.pipeline.publish
-import lerobot_wm.pipeline.train  # noqa: F401  (all imported for the forks)
+import lerobot_wm.collect.command
+import lerobot_wm.encode.command
+import lerobot_wm.evaluate.command
+import lerobot_wm.hub.publish
+import lerobot_wm.train.command  # noqa: F401  (all imported for the forks)
 from lerobot_wm import cli
 
 HUB = httpx.URL(constants.ENDPOINT)

@@ -12,8 +12,7 @@ from lerobot.policies.factory import get_policy_class
 from PIL import Image
 from safetensors.torch import load
 
-from lerobot_wm.data.fingerprint import dataset_fingerprint, weights_fingerprint
-from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint, weights_fingerprint
 from tests.hub.conftest import Machine, read
 from tests.hub.server import Hub
 
@@ -21,7 +20,7 @@ PYTHON_BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 PULL = """
 from pathlib import Path
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.latents import dataset_fingerprint
 dataset = LeRobotDataset({repo_id!r}, revision={revision!r})
 print("fingerprint", dataset_fingerprint(Path(dataset.root)), sorted(dataset[0]))
 """

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from huggingface_hub import ModelCard
 
-from lerobot_wm.data.fingerprint import dataset_fingerprint
+from lerobot_wm.data.latents import dataset_fingerprint
 from tests.hub.conftest import TRAIN, Machine, read
 from tests.hub.server import Hub
 
@@ -23,7 +23,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot_wm.data.check import check_dataset
-from lerobot_wm.data.folder import dataset_folder
+from lerobot_wm.data.source import dataset_folder
 name = "user/demos"
 """
 

@@ -1,9 +1,8 @@
 import pytest
 import torch
 
-from lerobot_wm.nn.augment import random_crop
-from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder
-from lerobot_wm.nn.spatial_embeddings import SpatialEmbeddings
+from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder, SpatialEmbeddings
+from lerobot_wm.nn.images import random_crop
 
 
 def test_spatial_embeddings_equal_a_plain_loop() -> None:

@@ -8,8 +8,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
-from lerobot_wm.policies.action_noise import ActionNoise
-from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
+from lerobot_wm.policies.common.action_noise import ActionNoise
+from lerobot_wm.policies.common.multi_task_policy import MultiTaskPolicy
 
 STD = 0.3
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_wm.data.resize import resize_images
-from lerobot_wm.policies.cameras import camera_images, check_observation, side_by_side, stack_images
+from lerobot_wm.nn.images import resize_images
+from lerobot_wm.policies.common.cameras import camera_images, check_observation, side_by_side, stack_images
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.config import RSSMConfig

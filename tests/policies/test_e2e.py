@@ -10,13 +10,13 @@ from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file, save_file
 
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
+from lerobot_wm.policies.common.checks import check_environment_fits
+from lerobot_wm.policies.e2e.config import E2EConfig
+from lerobot_wm.policies.e2e.policy import E2EPolicy
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
 from lerobot_wm.policies.e2e_bc.modeling_e2e_bc import E2EBCPolicy
-from lerobot_wm.policies.e2e_config import E2EConfig
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
 from lerobot_wm.policies.e2e_iql.modeling_e2e_iql import E2EIQLPolicy
-from lerobot_wm.policies.e2e_policy import E2EPolicy
-from lerobot_wm.policies.fits import check_environment_fits
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
 POLICY_TYPES = ("e2e_bc", "e2e_iql")

@@ -18,9 +18,9 @@ from safetensors.torch import load_file
 from torch import nn
 from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTensorMode
 
+from lerobot_wm.encode.command import encode_to_cache
 from lerobot_wm.nn.mlp import MLP
-from lerobot_wm.pipeline.encode import encode_to_cache
-from lerobot_wm.policies.multi_task_policy import MultiTaskPolicy
+from lerobot_wm.policies.common.multi_task_policy import MultiTaskPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
 from tests.recording import FRONT, WRIST, camera, record, train_flags, vector

@@ -18,13 +18,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from lerobot_wm.data.latents import LatentRecord
-from lerobot_wm.pipeline.encode import encode_to_cache
-from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
+from lerobot_wm.encode.command import encode_to_cache
+from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone, load_backbone_weights
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
 from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy
-from lerobot_wm.policies.frozen_backbone.weights import load_backbone_weights
-from lerobot_wm.policies.frozen_encoder import encoder_fingerprint, load_encoder
-from lerobot_wm.policies.latent_setup import check_latents
+from lerobot_wm.policies.latent.encoder import encoder_fingerprint, load_encoder
+from lerobot_wm.policies.latent.setup import check_latents
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 from tests.recording import FRONT, WRIST, camera, record, vector
 

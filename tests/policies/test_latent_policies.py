@@ -17,8 +17,8 @@ from torch import Tensor
 
 from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.data.latents import LatentRecord
-from lerobot_wm.pipeline.encode import encode_to_cache
-from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.encode.command import encode_to_cache
+from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
@@ -380,7 +380,7 @@ def test_a_dataset_that_is_still_to_be_downloaded_is_encoded_once(
             shutil.copytree(demos_root / folder, root / folder, dirs_exist_ok=True)
         return LeRobotDataset(*args, **kwargs)
 
-    monkeypatch.setattr("lerobot_wm.pipeline.encode.LeRobotDataset", download)
+    monkeypatch.setattr("lerobot_wm.encode.command.LeRobotDataset", download)
     meta = LeRobotDatasetMetadata("test/demos", root=root)
     first = encode_to_cache(str(world_model_path), "test/demos", meta, "cpu")
     assert encode_to_cache(str(world_model_path), "test/demos", meta, "cpu") == first

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from lerobot_wm.policies.common.lr_decay import LRDecayConfig
+from lerobot_wm.policies.common.optim import FinalDecayConfig
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
-from lerobot_wm.policies.lr_decay import LRDecayConfig
-from lerobot_wm.policies.optim import FinalDecayConfig
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE, TASK
 from lerobot_wm.envs.tasks import task_description
-from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig

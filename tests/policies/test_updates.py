@@ -8,8 +8,8 @@ import torch
 from lerobot.utils.constants import OPTIMIZER_STATE
 from safetensors.torch import load_file
 
-from lerobot_wm.pipeline.divergence import DivergenceError
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
+from lerobot_wm.train.accelerator import DivergenceError
 from tests.flags import TRAIN_FLAGS
 
 Train = Callable[..., dict[str, torch.Tensor]]

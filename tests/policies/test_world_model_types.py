@@ -17,7 +17,7 @@ from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import Fr
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
-from lerobot_wm.policies.world_model_config import WorldModelConfig
+from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.world_model.config import RSSMConfig
 
 

@@ -10,13 +10,13 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import ACTION, FPS, OBS_IMAGE, OBS_STATE
+from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
-from lerobot_wm.hub.source import SourceConfig
+from lerobot_wm.inspect.open_loop import WINDOW
+from lerobot_wm.inspect.quality import QualityConfig, quality
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.report.open_loop import WINDOW
-from lerobot_wm.report.quality import QualityConfig, quality
-from lerobot_wm.report.records import Record, record_line
+from lerobot_wm.records import Record, record_line
 from lerobot_wm.world_model.config import RSSMConfig
 
 TASKS = ("reach-v3", "window-close-v3")

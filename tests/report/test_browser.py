@@ -13,11 +13,11 @@ from lerobot.utils.io_utils import write_video
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.schema import COLLECTION_RECORD
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.report.build import ReportConfig, report
-from lerobot_wm.report.open_loop import WINDOW
-from lerobot_wm.report.records import Record, record_line
+from lerobot_wm.inspect.open_loop import WINDOW
+from lerobot_wm.records import Record, record_line
+from lerobot_wm.report.command import ReportConfig, report
 from tests.recording import camera, record, vector
 
 CHROMIUM = shutil.which("chromium")

@@ -13,11 +13,12 @@ from lerobot.utils.io_utils import write_video
 from PIL import Image
 
 from lerobot_wm import cli
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.report import build, videos
-from lerobot_wm.report.build import ReportConfig, report
-from lerobot_wm.report.inline import MP4, data_uri
-from lerobot_wm.report.records import record_line
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.html import MP4, data_uri
+from lerobot_wm.records import record_line
+from lerobot_wm.report import command as build
+from lerobot_wm.report import videos
+from lerobot_wm.report.command import ReportConfig, report
 from tests.recording import record_stranger
 
 VOID = {"meta", "img", "br"}
@@ -156,7 +157,7 @@ def test_episodes_too_short_to_imagine_do_not_cost_the_report(
     episodes_root: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("lerobot_wm.report.open_loop.WINDOW", 1000)
+    monkeypatch.setattr("lerobot_wm.inspect.open_loop.WINDOW", 1000)
     dataset = SourceConfig("test/episodes", str(episodes_root))
     index = report(
         ReportConfig(

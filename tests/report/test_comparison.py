@@ -8,9 +8,8 @@ from scipy.stats import ttest_1samp, ttest_ind
 
 from lerobot_wm.experiment.arms import ARMS as EXPERIMENT_ARMS
 from lerobot_wm.experiment.arms import WM_RSSM
-from lerobot_wm.report.arms import SHARING_WORLD_MODEL
-from lerobot_wm.report.comparison import compare, compare_arms
-from lerobot_wm.report.records import Record
+from lerobot_wm.records import Record
+from lerobot_wm.report.comparison import SHARING_WORLD_MODEL, compare, compare_arms
 
 TASKS = {"reach-v3": (5, 20), "window-close-v3": (10, 30)}
 

@@ -9,7 +9,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
-from lerobot_wm.hub.source import SourceConfig
+from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.report.data_summary import summarise_data
 from tests.recording import FRAME_SHAPES, record_stranger
 

@@ -17,21 +17,20 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, REWARD, SUCCESS, TASK
-from lerobot_wm.data.resize import resize_images
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.pipeline.dream import CheckpointConfig, DreamConfig, dream_of
-from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.dream import OWN_ACTIONS, TRUE_ACTIONS, ZERO_ACTIONS, Dreams, dream
+from lerobot_wm.inspect.dream_command import CheckpointConfig, DreamConfig, dream_of
+from lerobot_wm.inspect.dream_figures import STEPS_SHOWN, dream_clips, strip_figure, video_frames
+from lerobot_wm.inspect.episodes import read_episodes, reward_key
+from lerobot_wm.inspect.open_loop import load_world_model
+from lerobot_wm.nn.images import resize_images
+from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.report.dream import OWN_ACTIONS, TRUE_ACTIONS, ZERO_ACTIONS, Dreams, dream
-from lerobot_wm.report.dream_clips import dream_clips
-from lerobot_wm.report.dream_figures import STEPS_SHOWN, strip_figure, video_frames
-from lerobot_wm.report.episodes import read_episodes, reward_key
-from lerobot_wm.report.open_loop import load_world_model
 from lerobot_wm.world_model.config import RSSMConfig
 from tests.report.quality_model import lively_world_model
 
@@ -145,7 +144,7 @@ def test_episodes_are_read_some_frames_at_a_time_and_at_the_models_size(
     root: Path, checkpoints: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy, dataset = load_world_model(str(checkpoints["wm_rssm"])), LeRobotDataset("test/dream", root=root)
-    monkeypatch.setattr("lerobot_wm.report.episodes._FRAMES_AT_ONCE", 7)
+    monkeypatch.setattr("lerobot_wm.inspect.episodes._FRAMES_AT_ONCE", 7)
     first = 0
     for episode, length in zip(
         read_episodes(policy, dataset.meta, SourceConfig("test/dream", str(root)), [0, 1, 2], 20),

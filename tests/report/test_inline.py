@@ -6,8 +6,8 @@ from collections.abc import Callable
 import pytest
 from matplotlib.figure import Figure
 
-from lerobot_wm.report.inline import PNG, SVG, figure_bytes
-from lerobot_wm.report.split_figure import split_figure
+from lerobot_wm.inspect.html import PNG, SVG, figure_bytes
+from lerobot_wm.report.page import split_figure
 
 
 @pytest.mark.parametrize("mime_type", [PNG, SVG])

@@ -9,9 +9,15 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.report.latents import FRAMES_PER_EPISODE, LatentMap, latent_figures, latent_map, task_colours
-from lerobot_wm.report.open_loop import load_world_model
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.latent_map import (
+    FRAMES_PER_EPISODE,
+    LatentMap,
+    latent_figures,
+    latent_map,
+    task_colours,
+)
+from lerobot_wm.inspect.open_loop import load_world_model
 from lerobot_wm.world_model.rssm import RSSMState
 from tests.report.quality_model import lively_world_model
 
@@ -86,7 +92,7 @@ def test_long_episodes_are_read_to_a_bound(
     dataset: LeRobotDataset, world_model_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Whole episodes of ten thousand frames took minutes and gigabytes.
-    monkeypatch.setattr("lerobot_wm.report.latents.MAX_FRAMES", 20)
+    monkeypatch.setattr("lerobot_wm.inspect.latent_map.MAX_FRAMES", 20)
     policy = load_world_model(str(world_model_path))
     read = []
     model_filter = policy.world_model.filter

@@ -13,12 +13,8 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.policies.latent_policy import LatentPolicy
-from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
-from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.report.open_loop import (
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.open_loop import (
     CONTEXT,
     HORIZONS,
     WINDOW,
@@ -27,6 +23,10 @@ from lerobot_wm.report.open_loop import (
     open_loop,
     strips_figure,
 )
+from lerobot_wm.policies.latent.policy import LatentPolicy
+from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
+from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import SMALL_WORLD_MODEL
 
 

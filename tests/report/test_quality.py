@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from lerobot_wm.report import quality
-from lerobot_wm.report.open_loop import load_world_model
-from lerobot_wm.report.quality_page import quality_section
+from lerobot_wm.inspect import quality
+from lerobot_wm.inspect.open_loop import load_world_model
+from lerobot_wm.inspect.quality_figures import quality_section
 
 
 class Section(HTMLParser):

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from lerobot_wm.constants import OBS_IMAGE
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.report.quality_dynamics import drift, kl_quality, reward_quality
-from lerobot_wm.report.quality_episodes import Episode, Filtered, filter_episodes, read_episodes
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.quality_dynamics import drift, kl_quality, reward_quality
+from lerobot_wm.inspect.quality_episodes import Episode, Filtered, filter_episodes, read_episodes
 from lerobot_wm.world_model.model import WorldModel
 from tests.report.quality_model import lively_world_model
 

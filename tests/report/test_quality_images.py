@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.report.open_loop import WINDOW, load_world_model, predict
-from lerobot_wm.report.quality_episodes import (
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.open_loop import WINDOW, load_world_model, predict
+from lerobot_wm.inspect.quality_episodes import (
     Episode,
     choose_episodes,
     filter_episodes,
     read_episodes,
     start_positions,
 )
-from lerobot_wm.report.quality_open_loop import (
+from lerobot_wm.inspect.quality_open_loop import (
     PREDICTIONS,
     image_errors,
     mean_and_median_image,

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from lerobot_wm.constants import OBS_IMAGE
-from lerobot_wm.hub.source import SourceConfig
-from lerobot_wm.report.open_loop import load_world_model
-from lerobot_wm.report.quality_episodes import filter_episodes, read_episodes
-from lerobot_wm.report.quality_probes import (
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.open_loop import load_world_model
+from lerobot_wm.inspect.quality_episodes import filter_episodes, read_episodes
+from lerobot_wm.inspect.quality_probes import (
     BLIND,
     EMBEDDING,
     FRAMES_PER_EPISODE,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_wm.report.records import find_records, read_records, record_line
+from lerobot_wm.records import find_records, read_records, record_line
 
 
 def test_lists_and_globs(tmp_path: Path) -> None:

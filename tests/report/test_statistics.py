@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from lerobot_wm.report.statistics import SuccessRate, ci95_summary, in_split, success_rate
+from lerobot_wm.statistics import SuccessRate, ci95_summary, in_split, success_rate
 
 
 def test_wilson_interval_of_the_papers_table() -> None:

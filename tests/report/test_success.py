@@ -5,17 +5,16 @@ from collections.abc import Callable
 import pytest
 
 from lerobot_wm.constants import MT6
-from lerobot_wm.report.arms import ARMS, by_arm
-from lerobot_wm.report.bootstrap import Estimate
-from lerobot_wm.report.paper_table import PAPER_TABLE
-from lerobot_wm.report.statistics import SuccessRate
+from lerobot_wm.report.comparison import ARMS, by_arm
 from lerobot_wm.report.success import (
+    PAPER_TABLE,
     comparison_tables,
     overall_table,
     paper_comparison,
     seed_table,
     task_table,
 )
+from lerobot_wm.statistics import Estimate, SuccessRate
 
 TASKS = {"button-press-topdown-v3": (10, 39), "reach-v3": (4, 15)}
 SIX = dict.fromkeys(MT6, (9, 30))

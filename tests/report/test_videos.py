@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_wm.report import videos
-from lerobot_wm.report.outcomes import outcome_grids
+from lerobot_wm.report.page import outcome_grids
 from lerobot_wm.report.videos import Clip, within_limit
 
 

@@ -7,9 +7,9 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
-from lerobot_wm.policies.cameras import camera_images
+from lerobot_wm.policies.common.cameras import camera_images
+from lerobot_wm.policies.e2e.policy import E2EPolicy
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
-from lerobot_wm.policies.e2e_policy import E2EPolicy
 from lerobot_wm.rl.bc import bc_loss
 
 

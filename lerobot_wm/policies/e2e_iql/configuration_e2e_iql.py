@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_wm.policies.e2e_config import E2EConfig
-from lerobot_wm.policies.iql_config import IQLConfig
+from lerobot_wm.policies.common.iql_config import IQLConfig
+from lerobot_wm.policies.e2e.config import E2EConfig
 
 
 @PreTrainedConfig.register_subclass("e2e_iql")

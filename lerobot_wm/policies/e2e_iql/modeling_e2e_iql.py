@@ -8,11 +8,11 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
-from lerobot_wm.policies.cameras import camera_images
+from lerobot_wm.policies.common.cameras import camera_images
+from lerobot_wm.policies.common.features import logged
+from lerobot_wm.policies.common.iql_agent import Outcomes, make_agent
+from lerobot_wm.policies.e2e.policy import E2EPolicy
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
-from lerobot_wm.policies.e2e_policy import E2EPolicy
-from lerobot_wm.policies.iql_agent import Outcomes, make_agent
-from lerobot_wm.policies.parts import logged
 
 
 class E2EIQLPolicy(E2EPolicy):

@@ -5,7 +5,7 @@ from typing import NoReturn
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_wm.policies.world_model_config import WorldModelConfig
+from lerobot_wm.policies.world_model.config import WorldModelConfig
 
 RGB_CHANNELS = 3
 

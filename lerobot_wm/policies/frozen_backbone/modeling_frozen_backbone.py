@@ -5,10 +5,9 @@ from typing import Any, NoReturn
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
-from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
+from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone, load_backbone_weights
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
-from lerobot_wm.policies.frozen_backbone.weights import load_backbone_weights
-from lerobot_wm.policies.world_model_policy import WorldModelPolicy
+from lerobot_wm.policies.world_model.policy import WorldModelPolicy
 
 
 class FrozenBackbonePolicy(WorldModelPolicy):

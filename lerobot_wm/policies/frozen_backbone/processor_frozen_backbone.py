@@ -1,6 +1,6 @@
 """Processors of the frozen backbone, where LeRobot's factory looks for them."""
 
-from lerobot_wm.policies.processors import (
+from lerobot_wm.policies.common.processors import (
     make_pre_post_processors as make_frozen_backbone_pre_post_processors,
 )
 

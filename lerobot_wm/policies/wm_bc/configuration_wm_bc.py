@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_wm.policies.latent_config import LatentPolicyConfig
-from lerobot_wm.policies.lr_decay import LRDecayConfig
+from lerobot_wm.policies.common.lr_decay import LRDecayConfig
+from lerobot_wm.policies.latent.config import LatentPolicyConfig
 
 
 @PreTrainedConfig.register_subclass("wm_bc")

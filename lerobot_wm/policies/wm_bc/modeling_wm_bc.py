@@ -6,8 +6,8 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
-from lerobot_wm.policies.compile import compiled
-from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.common.config import compiled
+from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.rl.bc import bc_loss
 

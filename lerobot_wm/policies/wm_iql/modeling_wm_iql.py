@@ -7,9 +7,9 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
-from lerobot_wm.policies.compile import compiled
-from lerobot_wm.policies.iql_agent import Outcomes, make_agent
-from lerobot_wm.policies.latent_policy import LatentPolicy
+from lerobot_wm.policies.common.config import compiled
+from lerobot_wm.policies.common.iql_agent import Outcomes, make_agent
+from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 
 

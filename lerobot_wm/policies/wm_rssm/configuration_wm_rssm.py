@@ -7,12 +7,12 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.conv import IMAGE_SIZE
-from lerobot_wm.policies.compile import CompileConfig
-from lerobot_wm.policies.features import feature_dim, training_dtype
-from lerobot_wm.policies.lr_decay import LRDecayConfig
-from lerobot_wm.policies.optim import FusedAdamConfig
-from lerobot_wm.policies.rewards import RewardConfig
-from lerobot_wm.policies.world_model_config import WorldModelConfig
+from lerobot_wm.policies.common.config import CompileConfig
+from lerobot_wm.policies.common.features import feature_dim, training_dtype
+from lerobot_wm.policies.common.lr_decay import LRDecayConfig
+from lerobot_wm.policies.common.optim import FusedAdamConfig
+from lerobot_wm.policies.common.rewards import RewardConfig
+from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.world_model.config import RSSMConfig
 
 

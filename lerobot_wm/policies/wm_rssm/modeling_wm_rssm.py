@@ -8,13 +8,12 @@ from lerobot.datasets.io_utils import load_stats
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
-from lerobot_wm.policies.cameras import camera_images
-from lerobot_wm.policies.compile import compiled
-from lerobot_wm.policies.features import stat
-from lerobot_wm.policies.parts import logged
-from lerobot_wm.policies.rewards import FrameLabel, reward_columns
+from lerobot_wm.policies.common.cameras import camera_images
+from lerobot_wm.policies.common.config import compiled
+from lerobot_wm.policies.common.features import logged, stat
+from lerobot_wm.policies.common.rewards import FrameLabel, reward_columns
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
-from lerobot_wm.policies.world_model_policy import WorldModelPolicy
+from lerobot_wm.policies.world_model.policy import WorldModelPolicy
 from lerobot_wm.world_model.model import WorldModel
 
 

@@ -1,0 +1,122 @@
+"""The flags of `lerobot-wm collect`, and the shards they ask for."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub.utils import validate_repo_id
+from lerobot.utils.constants import HF_LEROBOT_HOME
+
+from lerobot_wm.collect.shards import SHARD_EPISODES, Shard
+from lerobot_wm.constants import CAMERA_NAME, IMAGE_SIZE, MAX_EPISODE_STEPS, REPORTED_VARIATION_SET
+from lerobot_wm.envs.cameras import parse_cameras
+from lerobot_wm.envs.tasks import resolve_tasks
+from lerobot_wm.envs.variations import check_variation_set, parse_variations
+from lerobot_wm.system import Share
+
+
+@dataclass
+class CollectConfig:
+    """Collect successful demonstrations of Meta-World's scripted experts into a LeRobotDataset."""
+
+    # Name of the dataset, as user/name.
+    repo_id: str
+    # Folder of the dataset; by default LeRobot's own place for repo_id.
+    root: Path | None = None
+    # A task, a set (mt6, mt10, mt50) or a comma-separated list.
+    tasks: str = "mt6"
+    # Successful episodes to collect of each task, spread evenly over the variations.
+    episodes_per_task: int = 130
+    # Variations to collect on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
+    variations: str = "0-9"
+    # Set of variations: 42, for training and reported results, 43, for choosing settings and for probes, or 44.
+    variation_set: int = REPORTED_VARIATION_SET
+    # Standard deviation of the Gaussian noise added to the expert's clipped actions.
+    noise: float = 0.3
+    # Steps kept after the first success, so that successful observations are in the data.
+    steps_after_success: int = 8
+    # Attempts at a variation before its episode is given to the next variation.
+    max_attempts: int = 5
+    # Height and width of the images in pixels.
+    image_size: int = IMAGE_SIZE
+    # A camera of the simulator, or several separated by commas: corner2,topview.
+    camera_name: str = CAMERA_NAME
+    # Seed of the noise; the dataset is the same for a seed whatever num_workers.
+    seed: int = 0
+    # Processes that collect in parallel.
+    num_workers: int = 2
+    # Of several jobs, the one this is: 1/4 is the first of four. Each job collects its share of the shards into
+    # `<root>.shards`; when all are in one such folder, the same command without this flag merges them.
+    shard: str | None = None
+    # Upload the dataset as repo_id when it is complete, also where it was so before.
+    push_to_hub: bool = False
+    # Upload to a private repository.
+    private: bool = False
+    # Licence of the uploaded dataset, as the Hub names it.
+    license: str = "apache-2.0"
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        if self.root is None:  # else the name is no folder
+            validate_repo_id(self.repo_id)
+        resolve_tasks(self.tasks)
+        parse_variations(self.variations)
+        check_variation_set(self.variation_set)
+        parse_cameras(self.camera_name)
+        if self.shard is not None:
+            Share.parse(self.shard)
+        limits = {
+            "episodes_per_task": (1, None),
+            "noise": (0, None),
+            "steps_after_success": (0, MAX_EPISODE_STEPS),
+            "max_attempts": (1, None),
+            "image_size": (16, None),
+            "seed": (0, None),
+            "num_workers": (1, None),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if value < low or (high is not None and value > high):
+                limit = f"at least {low}" if high is None else f"{low} to {high}"
+                raise ValueError(f"{name} is {value}; expected {limit}.")
+
+    @property
+    def output_root(self) -> Path:
+        """The dataset's folder."""
+        return Path(self.root) if self.root is not None else HF_LEROBOT_HOME / self.repo_id
+
+    def identity(self) -> dict[str, Any]:
+        """Everything the content of the dataset depends on."""
+        return {
+            "tasks": list(resolve_tasks(self.tasks)),
+            "episodes_per_task": self.episodes_per_task,
+            "variation_set": self.variation_set,
+            "variations": list(parse_variations(self.variations)),
+            "noise": self.noise,
+            "steps_after_success": self.steps_after_success,
+            "max_attempts": self.max_attempts,
+            "image_size": self.image_size,
+            "camera_name": ",".join(parse_cameras(self.camera_name)),
+            "seed": self.seed,
+        }
+
+
+def plan_shards(config: CollectConfig) -> list[Shard]:
+    """The shards of a collection in the order of the final dataset: by task, then by episode."""
+    return [
+        Shard(
+            task=task,
+            first=first,
+            count=min(SHARD_EPISODES, config.episodes_per_task - first),
+            variation_set=config.variation_set,
+            variations=parse_variations(config.variations),
+            noise=config.noise,
+            steps_after_success=config.steps_after_success,
+            max_attempts=config.max_attempts,
+            seed=config.seed,
+            image_size=config.image_size,
+            cameras=parse_cameras(config.camera_name),
+        )
+        for task in resolve_tasks(config.tasks)
+        for first in range(0, config.episodes_per_task, SHARD_EPISODES)
+    ]

@@ -1,0 +1,130 @@
+"""`lerobot-wm expert`: the scripted expert as an arm, one rollout without noise on each variation."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import draccus
+import numpy as np
+from rich.console import Console
+from tqdm import tqdm
+
+from lerobot_wm.collect.episode import demonstrate
+from lerobot_wm.constants import MAX_EPISODE_STEPS, NUM_VARIATIONS, RECORDS_NAME, REPORTED_VARIATION_SET
+from lerobot_wm.envs.simulation import Simulation
+from lerobot_wm.envs.tasks import resolve_tasks
+from lerobot_wm.envs.variations import check_variation_set, is_seen, parse_variations
+from lerobot_wm.files import write_whole
+from lerobot_wm.quiet import quiet, silence
+from lerobot_wm.records import Record, new_records, record_line
+from lerobot_wm.tables import table_by_split, terminal_tables
+from lerobot_wm.workers import map_in_workers
+
+ARM = "expert"
+
+
+@dataclass
+class ExpertConfig:
+    """Flags of `lerobot-wm expert`."""
+
+    # Folder of records.jsonl.
+    output_dir: Path
+    # A task, a set (mt6, mt10, mt50) or a comma-separated list.
+    tasks: str = "mt6"
+    # Set of variations: 42, for reporting results; 43, for choosing settings and for probes; 44, for confirming.
+    variation_set: int = REPORTED_VARIATION_SET
+    # Variations to roll out on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
+    variations: str = f"0-{NUM_VARIATIONS - 1}"
+    # Steps after which a rollout is a failure, at most 500; as --env.episode_length of `lerobot-wm eval`.
+    episode_length: int = MAX_EPISODE_STEPS
+    # Name of the settings in records.
+    preset: str = "custom"
+    # Processes; each takes whole tasks.
+    num_workers: int = 2
+
+    def validate(self) -> None:
+        """Refuse what cannot run.
+
+        Raises:
+            ValueError: a flag names what does not exist.
+            FileExistsError: the records file is there already.
+        """
+        resolve_tasks(self.tasks)
+        check_variation_set(self.variation_set)
+        parse_variations(self.variations)
+        if not 1 <= self.episode_length <= MAX_EPISODE_STEPS:
+            raise ValueError(f"episode_length is {self.episode_length}; expected 1 to {MAX_EPISODE_STEPS}.")
+        if self.num_workers < 1:
+            raise ValueError(f"--num_workers={self.num_workers}: expected at least 1.")
+
+    @property
+    def records_file(self) -> Path:
+        """The records file to write."""
+        return self.output_dir / RECORDS_NAME
+
+
+def roll_out_expert(cfg: ExpertConfig) -> list[Record]:
+    """Roll the experts out and write their records, as `lerobot-wm eval` writes a policy's.
+
+    Raises:
+        ValueError: see `ExpertConfig.validate`.
+        FileExistsError, BlockingIOError: see `new_records`.
+    """
+    cfg.validate()
+    with new_records(cfg.records_file):
+        return _write_records(cfg, resolve_tasks(cfg.tasks))
+
+
+def _write_records(cfg: ExpertConfig, tasks: tuple[str, ...]) -> list[Record]:
+    records = [
+        record
+        for of_task in tqdm(_rollouts(cfg, tasks), total=len(tasks), desc="Rolling out", unit="task")
+        for record in of_task
+    ]
+    write_whole(cfg.records_file, "".join(map(record_line, records)))
+    return records
+
+
+def _rollouts(cfg: ExpertConfig, tasks: tuple[str, ...]) -> Iterator[list[Record]]:
+    """Records task by task, in the order of `tasks`."""
+    if cfg.num_workers == 1:
+        with quiet():
+            yield from map(partial(_roll_out, cfg), tasks)
+        return
+    yield from map_in_workers(partial(_roll_out, cfg), tasks, min(cfg.num_workers, len(tasks)), silence)
+
+
+def _roll_out(cfg: ExpertConfig, task: str) -> list[Record]:
+    simulation = Simulation(task, cfg.variation_set)
+    return [_record(cfg, simulation, variation) for variation in parse_variations(cfg.variations)]
+
+
+def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record:
+    """One rollout: as in the environment, success or `episode_length` steps end it, and success is the reward."""
+    rng = np.random.default_rng(0)  # draws nothing that matters: the noise has no width
+    demonstration = demonstrate(
+        simulation, variation, noise=0.0, steps_after_success=0, rng=rng, max_steps=cfg.episode_length
+    )
+    success = demonstration is not None
+    return {
+        "arm": ARM,
+        "policy_type": "scripted",
+        "preset": cfg.preset,
+        "seed": 0,
+        "task": simulation.task,
+        "variation": variation,
+        "seen": is_seen(variation, cfg.variation_set),
+        "success": success,
+        "steps": cfg.episode_length if demonstration is None else len(demonstration.actions),
+        "return": float(success),
+        "variation_set": cfg.variation_set,
+    }
+
+
+def main() -> None:
+    """Entry point of `lerobot-wm expert`."""
+    cfg = draccus.parse(ExpertConfig)
+    records = roll_out_expert(cfg)
+    Console(width=100).print(*terminal_tables(table_by_split("Success of the scripted expert", records)))
+    print(f"Records: {cfg.records_file}")

@@ -1,0 +1,133 @@
+"""`lerobot-wm relabel`: a copy of a dataset whose `next.reward` is another of its columns.
+
+Any policy type then learns from that reward, through both training commands.
+"""
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import draccus
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
+from lerobot.datasets.io_utils import write_stats, write_table_one_row_group_per_episode
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tqdm import tqdm
+
+from lerobot_wm.constants import REWARD
+from lerobot_wm.data.latents import dataset_fingerprint
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.schema import RELABEL_RECORD
+from lerobot_wm.files import sole_writer
+
+
+@dataclass
+class RelabelConfig:
+    """Flags of `lerobot-wm relabel`.
+
+    Args:
+        dataset: The dataset to copy.
+        reward: The column that becomes `next.reward`, such as `next.dense_reward`. IQL on one that is above zero on the
+            way to success needs `--policy.done_key=never`.
+        output_repo_id: Repository id of the copy.
+        output_root: Its folder; must not exist yet.
+    """
+
+    dataset: SourceConfig
+    reward: str
+    output_repo_id: str
+    output_root: Path
+
+
+def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_root: Path) -> LeRobotDataset:
+    """Write a copy of `source` with `next.reward` taken from the column `reward`; nothing else differs.
+
+    `meta/relabel.json` says which column it was. The copy is written beside `output_root` and moved there when
+    whole. LeRobot's `modify_features` cannot replace a feature, and leaves the statistics of episodes as they were.
+
+    Returns:
+        The copy.
+
+    Raises:
+        FileExistsError: `output_root` is there already.
+        BlockingIOError: Another process writes it.
+        ValueError: The dataset has no such column, or one of another kind than its `next.reward`, or no `next.reward`.
+    """
+    if REWARD not in source.meta.features:
+        raise ValueError(
+            f"{source.repo_id} has no '{REWARD}' that could be replaced: name the column where you train, "
+            f"--policy.reward_key={reward}."
+        )
+    kinds = {name: (feature["dtype"], *feature["shape"]) for name, feature in source.meta.features.items()}
+    if reward not in kinds or kinds[reward] != kinds[REWARD]:
+        alike = [name for name in kinds if name.startswith("next.") and kinds[name] == kinds[REWARD]]
+        raise ValueError(
+            f"--reward={reward}: {source.repo_id} has no such column of the kind of its '{REWARD}', "
+            f"{kinds[REWARD]}. Columns of that kind: {', '.join(alike) or 'none'}."
+        )
+    with sole_writer(output_root):
+        if output_root.exists():
+            raise FileExistsError(
+                f"{output_root} is there already: choose another --output_root, or remove it."
+            )
+        _write(source, reward, output_root)
+    return LeRobotDataset(output_repo_id, root=output_root)
+
+
+def _write(source: LeRobotDataset, reward: str, output_root: Path) -> None:
+    partial = output_root.with_name(f"{output_root.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    root = Path(source.root)
+    files = [
+        path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*") if path.is_file()
+    ]
+    for path in tqdm(files, desc="Copying", unit="file"):
+        copy = partial / path.relative_to(root)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, copy)
+    for file in (partial / "data").rglob("*.parquet"):
+        table = pq.read_table(file)
+        write_table_one_row_group_per_episode(_with_column(table, REWARD, table[reward]), file)
+    episodes = _episode_stats(source, reward)
+    for file in (partial / "meta" / "episodes").rglob("*.parquet"):
+        table = pq.read_table(file)
+        of_file = [episodes[index] for index in table["episode_index"].to_pylist()]
+        for key in episodes[0]:
+            name = f"stats/{REWARD}/{key}"
+            if name in table.column_names:
+                table = _with_column(table, name, pa.array([stats[key].tolist() for stats in of_file]))
+        pq.write_table(table, file)
+    of_all = aggregate_stats([{REWARD: stats} for stats in episodes])
+    write_stats({**source.meta.stats, **of_all}, partial)
+    record = {
+        "reward": reward,
+        "source_repo_id": source.repo_id,
+        "source_fingerprint": dataset_fingerprint(root),
+    }
+    (partial / RELABEL_RECORD).write_text(json.dumps(record, indent=2) + "\n")
+    partial.replace(output_root)
+
+
+def _with_column(table: pa.Table, name: str, values: pa.ChunkedArray | pa.Array) -> pa.Table:
+    """The table with other values in one of its columns, of the same type."""
+    index = table.schema.get_field_index(name)
+    return table.set_column(index, table.schema.field(index), values.cast(table.schema.field(index).type))
+
+
+def _episode_stats(source: LeRobotDataset, column: str) -> list[dict[str, np.ndarray]]:
+    """Statistics of a column in each episode: a column that LeRobot's `add_features` wrote has none yet."""
+    values = np.stack(source.hf_dataset.with_format("numpy")[column][:]).reshape(len(source), -1)  # (N, 1)
+    rows = (
+        slice(episode["dataset_from_index"], episode["dataset_to_index"]) for episode in source.meta.episodes
+    )
+    return [get_feature_stats(values[row], axis=0, keepdims=False) for row in rows]
+
+
+def main() -> None:
+    """Entry point of `lerobot-wm relabel`."""
+    cfg = draccus.parse(RelabelConfig)
+    dataset = relabel(cfg.dataset.open(), cfg.reward, cfg.output_repo_id, cfg.output_root)
+    print(f"{dataset.num_frames} frames with the reward {cfg.reward} -> {cfg.output_root}")

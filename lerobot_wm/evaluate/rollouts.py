@@ -1,0 +1,151 @@
+"""LeRobot's own `rollout`, arranged so that each seed of each task runs exactly once."""
+
+from contextlib import nullcontext
+from itertools import batched
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.scripts.lerobot_eval import rollout
+from lerobot.utils.device_utils import get_safe_torch_device
+from lerobot.utils.io_utils import write_video
+from lerobot.utils.random_utils import set_seed
+
+from lerobot_wm.evaluate.config import EvaluateConfig, variation_of
+from lerobot_wm.records import Record
+from lerobot_wm.train.resume import training_config
+
+VIDEO_SIZE = 256  # frames are enlarged by a whole factor up to this height (pixels)
+
+
+def training_seed(policy_path: Path | None, revision: str | None = None) -> int | None:
+    """The seed a checkpoint (folder or Hub id) was trained with; None when it does not tell."""
+    return training_config(policy_path, revision).get("seed")
+
+
+class TaskRunner:
+    """A loaded policy and its environments, ready to roll out one task after the other."""
+
+    def __init__(self, cfg: EvaluateConfig) -> None:
+        self.cfg = cfg
+        self.device = get_safe_torch_device(cfg.policy.device)
+        self.training_seed = training_seed(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
+        # One vector environment per batch size: a shorter last batch must not run further seeds.
+        sizes = {len(seeds) for seeds in self._batches()}
+        self.envs = {size: make_task_envs(cfg, size) for size in sizes}
+        self.policy = make_policy(cfg=cfg.policy, env_cfg=cfg.env, rename_map=cfg.rename_map).eval()
+        preprocessor, postprocessor = make_pre_post_processors(
+            policy_cfg=cfg.policy,
+            pretrained_path=cfg.policy.pretrained_path,
+            pretrained_revision=cfg.policy.pretrained_revision,
+            preprocessor_overrides={
+                "device_processor": {"device": str(self.policy.config.device)},
+                "rename_observations_processor": {"rename_map": cfg.rename_map},
+            },
+        )
+        env_preprocessor, env_postprocessor = make_env_pre_post_processors(cfg.env, cfg.policy)
+        self.processors = {
+            "preprocessor": preprocessor,
+            "postprocessor": postprocessor,
+            "env_preprocessor": env_preprocessor,
+            "env_postprocessor": env_postprocessor,
+        }
+
+    def run(self, task: str) -> list[Record]:
+        """Roll out every seed of one task once; its videos of an earlier evaluation are removed."""
+        # Written over, a rollout that now ends otherwise would leave both outcomes.
+        for video in self._videos(task).glob("variation_*_*.mp4"):
+            video.unlink()
+        # Per task: a stochastic policy's rollouts must not depend on how tasks are spread over processes.
+        set_seed(self.cfg.seed)
+        records: list[Record] = []
+        for seeds in self._batches():
+            records += self._run_batch(self.envs[len(seeds)][task], task, list(seeds))
+        for envs in self.envs.values():
+            envs[task].close()
+        return records
+
+    def _batches(self) -> list[tuple[int, ...]]:
+        return list(batched(self.cfg.seeds, self.cfg.eval.batch_size))
+
+    def _run_batch(self, env: gym.vector.VectorEnv, task: str, seeds: list[int]) -> list[Record]:
+        filmed = [i for i, seed in enumerate(seeds) if seed < self.cfg.seed + self.cfg.videos_per_task]
+        frames: list[list[np.ndarray]] = []  # [step][filmed sub-environment]
+        use_amp = self.cfg.policy.use_amp
+        with torch.autocast(self.device.type) if use_amp else nullcontext():
+            data = rollout(
+                env,
+                self.policy,
+                **self.processors,
+                seeds=seeds,
+                render_callback=(lambda env: frames.append(_render(env, filmed))) if filmed else None,
+            )
+        records = [self._record(task, seed, data, i) for i, seed in enumerate(seeds)]
+        # Else it has begun anew when it is looked at: the last picture is of the next episode's start.
+        shows_the_end = env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP
+        for column, i in enumerate(filmed):
+            clip = [step[column] for step in frames[: records[i]["steps"] + shows_the_end]]
+            outcome = "success" if records[i]["success"] else "failure"
+            folder = self._videos(task)
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / f"variation_{records[i]['variation']:02d}_{outcome}.mp4"
+            write_video(path, [_enlarged(frame) for frame in clip], env.metadata["render_fps"])
+        return records
+
+    def _videos(self, task: str) -> Path:
+        return self.cfg.output_dir / "videos" / task
+
+    def _record(self, task: str, seed: int, data: dict[str, torch.Tensor], i: int) -> Record:
+        steps = int(data["done"][i].int().argmax()) + 1  # argmax: the first True
+        variation, seen = variation_of(self.cfg.env, seed)
+        return {
+            "arm": self.cfg.arm_name,
+            "policy_type": self.cfg.policy.type,
+            "preset": self.cfg.preset,
+            "seed": self.training_seed,
+            "task": task,
+            "variation": variation,
+            "seen": seen,
+            "success": bool(data["success"][i, :steps].any()),
+            "steps": steps,
+            "return": float(data["reward"][i, :steps].sum()),
+            "variation_set": getattr(self.cfg.env, "variation_set", None),
+        }
+
+
+def task_names(cfg: EvaluateConfig) -> list[str]:
+    """The tasks of the environment configuration, as records name them."""
+    envs = make_task_envs(cfg, n_envs=1)
+    close_envs(envs)
+    return list(envs)
+
+
+def make_task_envs(cfg: EvaluateConfig, n_envs: int) -> dict[str, gym.vector.VectorEnv]:
+    """Task name -> vector environment with `n_envs` sub-environments.
+
+    LeRobot's form is {group: {task id: vector environment}}, where metaworld_mt's groups are its tasks.
+    """
+    groups = make_env(cfg.env, n_envs, cfg.eval.use_async_envs, trust_remote_code=cfg.trust_remote_code)
+    return {
+        group if len(by_id) == 1 else f"{group}_{task_id}": env
+        for group, by_id in groups.items()
+        for task_id, env in by_id.items()
+    }
+
+
+def _render(env: gym.vector.VectorEnv, indices: list[int]) -> list[np.ndarray]:
+    """Current images (H, W, 3) of the chosen sub-environments."""
+    if isinstance(env, gym.vector.SyncVectorEnv):
+        return [np.asarray(env.envs[i].render()) for i in indices]
+    images = env.call("render")  # type: ignore[attr-defined]  # asynchronous ones have it
+    return [images[i] for i in indices]
+
+
+def _enlarged(image: np.ndarray) -> np.ndarray:
+    """(H, W, 3) -> (fH, fW, 3) with a whole factor f: players blur a 64-pixel video."""
+    factor = max(1, VIDEO_SIZE // image.shape[0])
+    return image.repeat(factor, axis=0).repeat(factor, axis=1)

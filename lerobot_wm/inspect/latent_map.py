@@ -1,0 +1,127 @@
+"""A map of the latent space: the states s_t of some episodes, projected to the plane by PCA."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from sklearn.decomposition import PCA
+from tqdm import tqdm
+
+from lerobot_wm.constants import ACTION, OBS_STATE, TASK
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.episodes import episodes_by_task, read_episodes
+from lerobot_wm.policies.common.cameras import camera_images
+from lerobot_wm.policies.latent.policy import LatentPolicy
+from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from lerobot_wm.world_model.model import WorldModel
+
+MAX_EPISODES = 48  # of all tasks together, but at least one of each
+MAX_FRAMES = (
+    500  # of an episode, its first: all of Meta-World's, and a bound to time and memory for longer ones
+)
+FRAMES_PER_EPISODE = 40  # drawn, spread evenly over what is read of it
+
+
+@dataclass(frozen=True)
+class LatentMap:
+    """N latents of an episode sample, in random order; of each episode the first `max_frames` at most.
+
+    `points` (N, 2) are their first two principal components and `explained` the share of the variance that each of
+    the two holds. `task` (N,) are positions in `tasks`; `time` (N,) runs from 0, the episode's first frame, to 1, the
+    last that was read.
+    """
+
+    tasks: list[str]
+    n_episodes: int
+    max_frames: int
+    n_dims: int
+    points: np.ndarray
+    explained: np.ndarray
+    task: np.ndarray
+    time: np.ndarray
+
+    @property
+    def legend(self) -> list[tuple[str, str]]:
+        """Each task with its colour, as HTML names it."""
+        return list(zip(self.tasks, task_colours(len(self.tasks)), strict=True))
+
+
+@torch.no_grad()
+def latent_map(
+    policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig
+) -> LatentMap:
+    """Filter the last episodes of each task, up to MAX_FRAMES, and project their latents, z_t at its posterior mean.
+
+    Args:
+        policy: Holds the world model.
+        meta: A dataset that it can read, see `check_features`.
+        source: Where it is.
+    """
+    world_model = policy.world_model
+    assert isinstance(world_model, WorldModel)  # as load_world_model checked
+    by_task = episodes_by_task(meta)
+    per_task = max(1, MAX_EPISODES // len(by_task))
+    episodes = sorted(index for of_task in by_task.values() for index in of_task[-per_task:])
+    tasks = list(by_task)
+    latents, task, time = [], [], []
+    read = read_episodes(policy, meta, source, episodes, MAX_FRAMES)
+    for episode in tqdm(read, total=len(episodes), desc="Mapping", unit="episode"):
+        batch = {key: value[None].to(policy.config.device) for key, value in episode.items() if key != TASK}
+        proprio = batch[OBS_STATE] if world_model.config.use_proprio else None
+        states = world_model.filter(camera_images(policy.config, batch), batch[ACTION], proprio)
+        of_episode = states.latent[0].cpu().numpy()  # (T, L)
+        last = len(of_episode) - 1
+        frames = np.unique(np.linspace(0, last, min(last + 1, FRAMES_PER_EPISODE)).round().astype(int))
+        latents.append(of_episode[frames])
+        task.append(np.full(len(frames), tasks.index(episode[TASK])))
+        time.append(frames / max(last, 1))
+    stacked = np.concatenate(latents)  # (N, L)
+    pca = PCA(2, random_state=0)
+    points = pca.fit_transform(stacked)
+    order = np.random.default_rng(0).permutation(
+        len(points)
+    )  # or the last task would be drawn over the others
+    return LatentMap(
+        tasks=tasks,
+        n_episodes=len(episodes),
+        max_frames=MAX_FRAMES,
+        n_dims=stacked.shape[1],
+        points=points[order],
+        explained=pca.explained_variance_ratio_,
+        task=np.concatenate(task)[order],
+        time=np.concatenate(time)[order],
+    )
+
+
+def task_colours(n_tasks: int) -> list[str]:
+    """Colours that are told apart as well as that many can be, as #rrggbb."""
+    if n_tasks <= 10:
+        return [to_hex(colormaps["tab10"](i)) for i in range(n_tasks)]
+    return [to_hex(colormaps["turbo"](i / (n_tasks - 1))) for i in range(n_tasks)]
+
+
+def latent_figures(latents: LatentMap) -> tuple[Figure, Figure]:
+    """The same points twice: coloured by task, and by time within the episode; the page holds the legends."""
+    by_task, axes = _axes(latents)
+    x, y = latents.points.T
+    colours = np.array(task_colours(len(latents.tasks)))
+    axes.scatter(x, y, s=7, c=colours[latents.task], linewidths=0, alpha=0.7)
+    by_time, axes = _axes(latents)
+    axes.scatter(x, y, s=7, c=latents.time, cmap="viridis", linewidths=0, alpha=0.7)
+    return by_task, by_time
+
+
+def _axes(latents: LatentMap) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(5.6, 5), layout="constrained")
+    axes = figure.subplots()
+    x, y = 100 * latents.explained
+    axes.set_xlabel(f"first component ({x:.0f}% of the variance)")
+    axes.set_ylabel(f"second component ({y:.0f}%)")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    return figure, axes

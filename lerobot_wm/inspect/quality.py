@@ -1,0 +1,206 @@
+"""`lerobot-wm quality`: how good a world model is, on positions it was never trained on."""
+
+import json
+import logging
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import draccus
+import torch
+
+from lerobot_wm.constants import QUALITY_NAME
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.episodes import episodes_by_task, world_model_config
+from lerobot_wm.inspect.html import PNG, SVG, figure_bytes
+from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model
+from lerobot_wm.inspect.quality_dynamics import drift, kl_quality, reward_quality
+from lerobot_wm.inspect.quality_episodes import Episode, filter_episodes, read_episodes, start_positions
+from lerobot_wm.inspect.quality_figures import EXAMPLES_NAME, examples_figure, quality_figures
+from lerobot_wm.inspect.quality_open_loop import (
+    FOREGROUND_THRESHOLD,
+    image_errors,
+    mean_and_median_image,
+    predictions,
+    summarise,
+)
+from lerobot_wm.inspect.quality_probes import FRAMES_PER_EPISODE, draw_frames, probe_positions, probe_task
+from lerobot_wm.policies.common.cameras import side_by_side
+from lerobot_wm.records import provenance
+from lerobot_wm.world_model.model import WorldModel
+
+logger = logging.getLogger(__name__)
+
+# Training episodes of each task that probes are fitted on, spread over the training data's variations.
+PROBE_EPISODES_PER_TASK = 40
+
+
+@dataclass
+class QualityConfig:
+    """Flags of `lerobot-wm quality`.
+
+    Args:
+        world_model_path: Folder or Hub id of a wm_rssm, wm_bc or wm_iql checkpoint.
+        dataset: Episodes of `lerobot-wm collect` to judge it on, of variations it was not trained on.
+        output_dir: Where quality.json and the figures go.
+        train_dataset: What it was trained on; probes are fitted on its episodes of the tasks of `dataset`, and it
+            has each of them. Without it they are fitted and tested on `dataset` by cross-validation over variations.
+        seed: Seed of every random choice.
+        episodes_per_task: Episodes of each task of `dataset`, spread over its variations.
+    """
+
+    world_model_path: str
+    dataset: SourceConfig
+    output_dir: Path
+    train_dataset: SourceConfig | None = None
+    seed: int = 0
+    episodes_per_task: int = 10
+
+
+def quality(cfg: QualityConfig) -> Path:
+    """Judge a world model and write quality.json and figures.
+
+    Returns:
+        The path of quality.json.
+
+    Raises:
+        ValueError: The checkpoint holds no world model, or a dataset cannot be judged on.
+    """
+    policy = load_world_model(cfg.world_model_path)
+    world_model, cameras = policy.world_model, policy.config.cameras
+    assert isinstance(world_model, WorldModel)  # as load_world_model checked
+    training, episodes = _read_datasets(cfg, cameras)
+    n_seen = _count_seen(training, episodes)
+    window_length = world_model_config(policy).window_length
+
+    logger.info("Filtering %d episodes", len(training) + len(episodes))
+    all_filtered = filter_episodes(world_model, training + episodes)
+    filtered = all_filtered[len(training) :]
+    # Open loop looks WINDOW frames ahead; the rest takes episodes of any length.
+    long = [i for i, episode in enumerate(episodes) if len(episode.actions) >= WINDOW]
+    tasks = [episodes[i].task for i in long]
+    mean_image, median_image = mean_and_median_image(episodes)
+    stacked = predictions(
+        world_model, [episodes[i] for i in long], [filtered[i] for i in long], mean_image, cfg.seed
+    )
+    # Side by side, each camera has a foreground of its own.
+    images = {name: side_by_side(of_name, len(cameras)) for name, of_name in stacked.items()}
+    median_image = side_by_side(median_image, len(cameras))
+
+    logger.info("Fitting probes")
+    all_untrained = filter_episodes(untrained(world_model, cfg.seed), training + episodes)
+    frames = draw_frames(training + episodes, all_filtered, all_untrained, len(training), cfg.seed)
+    result = {
+        "world_model": cfg.world_model_path,
+        "dataset": cfg.dataset.repo_id,
+        "train_dataset": cfg.train_dataset and cfg.train_dataset.repo_id,
+        "n_episodes": len(episodes),
+        "n_episodes_of_seen_positions": n_seen if training else None,
+        "settings": {
+            "seed": cfg.seed,
+            "context": CONTEXT,
+            "horizons": HORIZONS,
+            "foreground_threshold": FOREGROUND_THRESHOLD,
+            "restart": window_length,
+            "probe_frames_per_episode": FRAMES_PER_EPISODE,
+            "rssm": asdict(world_model.config),
+        },
+        "open_loop": summarise(image_errors(images, tasks, median_image)),
+        "reward": reward_quality(world_model, episodes, filtered)
+        if world_model.config.predict_reward
+        else None,
+        "probes": probe_positions(frames),
+        "task_probe": probe_task(frames),
+        "kl": kl_quality(episodes, filtered, world_model.config.free_nats),
+        "drift": drift(world_model, episodes, filtered, window_length),
+        "provenance": provenance(),
+    }
+    cfg.output_dir.mkdir(parents=True, exist_ok=True)
+    for name, figure in quality_figures(result).items():
+        (cfg.output_dir / f"quality_{name}.svg").write_bytes(figure_bytes(figure, SVG))
+    (cfg.output_dir / EXAMPLES_NAME).write_bytes(figure_bytes(examples_figure(images, tasks, HORIZONS), PNG))
+    path = cfg.output_dir / QUALITY_NAME
+    path.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def _read_datasets(cfg: QualityConfig, cameras: list[str]) -> tuple[list[Episode], list[Episode]]:
+    """Episodes of the training data (none where it is not given) and those to judge on."""
+    training = []
+    if cfg.train_dataset is not None:
+        source = cfg.train_dataset
+        tasks = _tasks_of_both(source, cfg.dataset)
+        training = read_episodes(source, cameras, PROBE_EPISODES_PER_TASK, cfg.seed, tasks)
+    episodes = read_episodes(cfg.dataset, cameras, cfg.episodes_per_task, cfg.seed)
+    n_long = sum(len(episode.actions) >= WINDOW for episode in episodes)
+    if n_long < 2:
+        raise ValueError(
+            f"{cfg.dataset.repo_id} has {n_long} episodes of {WINDOW} frames among the {len(episodes)} chosen; "
+            "open-loop prediction with shuffled actions needs 2."
+        )
+    return training, episodes
+
+
+def _tasks_of_both(training: SourceConfig, judged_on: SourceConfig) -> list[str]:
+    """The tasks to judge on; a warning where there is training data of others, of which nothing can be tested.
+
+    Raises:
+        DatasetError: A dataset is not whole.
+        ValueError: There is no training data of a task to judge on.
+    """
+    trained, judged = _tasks(training), _tasks(judged_on)
+    missing = [task for task in judged if task not in trained]
+    if missing:
+        raise ValueError(
+            f"{training.repo_id} has no episode of {', '.join(missing)}, which {judged_on.repo_id} has; it has "
+            f"{', '.join(trained)}: probes of a task are fitted on its training data. Judge on episodes of tasks that "
+            "the world model was trained on, or leave out --train_dataset for probes by cross-validation."
+        )
+    left_out = [task for task in trained if task not in judged]
+    if left_out:
+        logger.warning(
+            "%s has no episode of %s (of %s): the world model is not judged on that.",
+            judged_on.repo_id,
+            ", ".join(left_out),
+            training.repo_id,
+        )
+    return judged
+
+
+def _tasks(data: SourceConfig) -> list[str]:
+    """The tasks that a dataset has episodes of."""
+    return list(episodes_by_task(data.metadata()))
+
+
+def _count_seen(training: list[Episode], episodes: list[Episode]) -> int:
+    """How many episodes start from positions that training episodes start from; a warning if any."""
+    trained_on = set(start_positions(training))
+    n_seen = sum(position in trained_on for position in start_positions(episodes))
+    if n_seen:
+        logger.warning(
+            "%d of %d episodes start from positions of the training data: collect others.",
+            n_seen,
+            len(episodes),
+        )
+    return n_seen
+
+
+def untrained(world_model: WorldModel, seed: int) -> WorldModel:
+    """A world model of the same configuration and input scaling with fresh weights."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        fresh = WorldModel(world_model.config)
+    scaling = {
+        name: value
+        for name, value in world_model.state_dict().items()
+        if name.split(".")[0].endswith("_scaling")
+    }
+    fresh.load_state_dict(scaling, strict=False)
+    return fresh.eval().to(world_model.action_scaling.offset.device)
+
+
+def main() -> None:
+    """Entry point of `lerobot-wm quality`."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    logging.getLogger("lerobot").setLevel(logging.ERROR)  # it warns of its video decoder once per episode
+    path = quality(draccus.parse(QualityConfig))
+    print(f"World-model quality: {path}")

@@ -1,0 +1,217 @@
+"""Linear probes: what can be read from the latents on variations that the probe was not fitted on."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import pandas as pd
+from sklearn.decomposition import PCA
+from sklearn.dummy import DummyClassifier, DummyRegressor
+from sklearn.linear_model import LogisticRegression, Ridge
+from sklearn.metrics import r2_score
+from sklearn.model_selection import GridSearchCV, GroupKFold
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from tqdm import tqdm
+
+from lerobot_wm.inspect.quality_episodes import Episode, Filtered
+
+# Meta-World's 39-dimensional state (m): hand and first object at its start, the goal at its end.
+TARGETS = {"object": slice(4, 7), "gripper": slice(0, 3), "goal": slice(36, 39)}
+LATENT, EMBEDDING, UNTRAINED, PIXELS = "latent s_t", "frame-only e_t", "untrained RSSM", "raw-pixel PCA"
+# The probe that does not look at the image: the mean position, the most frequent task.
+BLIND = "no image"
+REPRESENTATIONS = (LATENT, EMBEDDING, UNTRAINED, PIXELS, BLIND)
+MEAN_OF_TASKS = "mean of tasks"
+
+FRAMES_PER_EPISODE = 15
+FOLDS = 5
+# Ridge penalties, for standardised features and some hundred frames: wide enough that latents, embeddings and
+# components each find theirs inside.
+ALPHAS = tuple(np.logspace(-3, 5, 9))
+_LOGISTIC_ITERATIONS = 1000
+_CM = 100.0
+
+Split = tuple[np.ndarray, np.ndarray]  # rows to fit on, rows to test on
+
+
+class Probe(Protocol):
+    """What fits here: a scikit-learn estimator."""
+
+    def fit(self, x: np.ndarray, y: np.ndarray) -> "Probe":
+        """Fit to features (N, D) and targets."""
+
+    def predict(self, x: np.ndarray) -> np.ndarray:
+        """Predict targets for features (N, D)."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """N frames drawn from episodes, in the representations compared."""
+
+    features: dict[str, np.ndarray]  # (N, ·) float64 by representation; float32 loses the smallest penalties
+    env_state: np.ndarray  # (N, 39), m
+    tasks: np.ndarray  # (N,) task strings
+    variations: np.ndarray  # (N,) what frames are split by, never by frame
+    to_fit: np.ndarray | None  # (N,) bool, frames of the training data; None: fit by cross-validation
+
+
+def draw_frames(
+    episodes: list[Episode], filtered: list[Filtered], untrained: list[Filtered], n_fit: int, seed: int
+) -> Frames:
+    """FRAMES_PER_EPISODE frames of each episode, at random.
+
+    The principal components are as many as the latent has dimensions (or there are frames), and are fitted to
+    the frames of the training data; without those, to all frames, which favours them a little.
+
+    Args:
+        episodes: Episodes of the training data first, then held-out ones.
+        filtered: Their closed loops.
+        untrained: Their closed loops under an untrained world model.
+        n_fit: How many of the episodes are training data; with 0 probes are fitted by cross-validation.
+        seed: Seed of the draw and of the principal components.
+    """
+    rng = np.random.default_rng(seed)
+    picks = [
+        np.sort(
+            rng.choice(len(episode.actions), min(FRAMES_PER_EPISODE, len(episode.actions)), replace=False)
+        )
+        for episode in episodes
+    ]
+    counts = [len(pick) for pick in picks]
+
+    def per_frame(values: list) -> np.ndarray:
+        return np.repeat(values, counts)
+
+    def gather(arrays: list) -> np.ndarray:
+        return np.concatenate([array[pick] for array, pick in zip(arrays, picks, strict=True)])
+
+    to_fit = per_frame([i < n_fit for i in range(len(episodes))])
+    pixels = np.concatenate(
+        [
+            episode.images(pick.tolist()).flatten(1).numpy()
+            for episode, pick in zip(episodes, picks, strict=True)
+        ]
+    )  # (N, C·64·64)
+    latents = gather([loop.latents.numpy() for loop in filtered])  # (N, D+S)
+    fitted_to = pixels[to_fit] if n_fit else pixels
+    pca = PCA(min(latents.shape[1], *fitted_to.shape), svd_solver="randomized", random_state=seed)
+    pca.fit(fitted_to)
+    features = {
+        LATENT: latents,
+        EMBEDDING: gather([loop.embeds.numpy() for loop in filtered]),  # (N, E)
+        UNTRAINED: gather([loop.latents.numpy() for loop in untrained]),  # (N, D+S)
+        PIXELS: _scores(pca, pixels),
+        BLIND: np.zeros((len(pixels), 1)),
+    }
+    return Frames(
+        features={name: x.astype(np.float64) for name, x in features.items()},
+        env_state=gather([episode.env_state.numpy() for episode in episodes]),
+        tasks=per_frame([episode.task for episode in episodes]),
+        variations=per_frame([episode.variation for episode in episodes]),
+        to_fit=to_fit if n_fit else None,
+    )
+
+
+def _scores(pca: PCA, pixels: np.ndarray) -> np.ndarray:
+    """Principal components (N, K) with a mean variance of 1, in their own proportions."""
+    return pca.transform(pixels) / np.sqrt(pca.explained_variance_.mean())
+
+
+def splits(frames: Frames, rows: np.ndarray) -> list[Split]:
+    """How `rows` are divided: the training data against the rest, or in folds that share no variation.
+
+    Raises:
+        ValueError: Too few variations to fit on some, choose the penalty on others and test on a third.
+    """
+    variations = frames.variations[rows]
+    n = len(np.unique(variations if frames.to_fit is None else variations[frames.to_fit[rows]]))
+    needed = 3 if frames.to_fit is None else 2
+    if n < needed:
+        raise ValueError(
+            f"Probes of '{frames.tasks[rows[0]]}' have {n} variation(s) to be fitted on, and need {needed}: use a "
+            "dataset with more variations, or raise --episodes_per_task."
+        )
+    if frames.to_fit is not None:
+        fit = frames.to_fit[rows]
+        return [(rows[fit], rows[~fit])]
+    folds = GroupKFold(min(FOLDS, n)).split(rows, groups=variations)
+    return [(rows[fit], rows[test]) for fit, test in folds]
+
+
+def fit_ridge(x: np.ndarray, y: np.ndarray, variations: np.ndarray, *, standardise: bool = True) -> Probe:
+    """Ridge regression (N, D) -> (N, 3) whose penalty does best on variations left out of the fit.
+
+    Args:
+        x: Features, standardised here unless their scale has a meaning, as that of principal components has.
+        y: Targets.
+        variations: What folds are split by, (N,).
+        standardise: Give every feature a variance of 1.
+    """
+    folds = GroupKFold(min(FOLDS, len(np.unique(variations))))
+    search = GridSearchCV(Ridge(), {"alpha": ALPHAS}, cv=folds, scoring="neg_mean_squared_error")
+    model = make_pipeline(StandardScaler(with_std=standardise), search)
+    return model.fit(x, y, gridsearchcv__groups=variations)
+
+
+def probe_positions(frames: Frames) -> list[dict]:
+    """Error of object, gripper and goal position per task and representation, and its mean over tasks.
+
+    One probe per task, since what the object is differs between tasks. `r2` is the share of the held-out
+    positions' variance that is explained, summed over x, y and z; below 0 is worse than their mean.
+    """
+    rows = []
+    for task in tqdm(dict.fromkeys(frames.tasks.tolist()), desc="Probing", unit="task"):
+        of_task = np.flatnonzero(frames.tasks == task)
+        parts = splits(frames, of_task)
+        for target, columns in TARGETS.items():
+            truth = frames.env_state[:, columns]  # (N, 3)
+            for name in REPRESENTATIONS:
+                x = frames.features[name]
+                tested, predicted = [], []
+                for fit, test in parts:
+                    if name == BLIND:
+                        probe = DummyRegressor().fit(x[fit], truth[fit])
+                    else:
+                        variations = frames.variations[fit]
+                        probe = fit_ridge(x[fit], truth[fit], variations, standardise=name != PIXELS)
+                    tested.append(truth[test])
+                    predicted.append(probe.predict(x[test]))
+                y, y_hat = np.concatenate(tested), np.concatenate(predicted)
+                error = _CM * np.linalg.norm(y - y_hat, axis=1)
+                rows.append(
+                    {
+                        "task": task,
+                        "target": target,
+                        "representation": name,
+                        "median_cm": float(np.median(error)),
+                        "mean_cm": float(error.mean()),
+                        "r2": float(r2_score(y, y_hat, multioutput="variance_weighted")),
+                    }
+                )
+    groups = pd.DataFrame(rows).groupby(["target", "representation"], sort=False, as_index=False)
+    means = groups[["median_cm", "mean_cm", "r2"]].mean().assign(task=MEAN_OF_TASKS)
+    return rows + means.to_dict("records")
+
+
+def probe_task(frames: Frames) -> list[dict]:
+    """Share of frames whose task a logistic regression tells, by representation; empty where there is one task."""
+    if len(set(frames.tasks)) == 1:
+        return []
+    rows = []
+    parts = splits(frames, np.arange(len(frames.tasks)))
+    for name in REPRESENTATIONS:
+        x = frames.features[name]
+        correct = []
+        for fit, test in parts:
+            probe = (
+                DummyClassifier()
+                if name == BLIND
+                else make_pipeline(
+                    StandardScaler(with_std=name != PIXELS), LogisticRegression(max_iter=_LOGISTIC_ITERATIONS)
+                )
+            )
+            probe.fit(x[fit], frames.tasks[fit])
+            correct.append(probe.predict(x[test]) == frames.tasks[test])
+        rows.append({"representation": name, "accuracy": float(np.concatenate(correct).mean())})
+    return rows
