@@ -99,7 +99,7 @@ class IQLAgent(nn.Module):
         return [{"params": list(network.parameters())} for network in (self.actors, self.critic, self.value)]
 
     def mean_action(self, observation: Tensor, beta: float) -> Tensor:
-        """Compute the mean action (B, A), scaled to [-1, 1], of the actor trained with `beta`; observations are (B, O)."""
+        """Compute the mean action (B, A) in [-1, 1] of the actor trained with `beta`, for observations (B, O)."""
         return self.actors[self.betas.index(beta)](observation)[0]
 
     def loss(
