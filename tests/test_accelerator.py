@@ -8,10 +8,10 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot_wm.train.accelerator import RamAccelerator, make_accelerator
 from torch import Tensor, nn
 
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
-from lerobot_wm.train.accelerator import RamAccelerator, make_accelerator
 
 
 class Line(nn.Module):

@@ -30,7 +30,7 @@ from lerobot_wm.experiment.arms import WM_RSSM, Arm, Encoder
 from lerobot_wm.experiment.preset import Preset
 from lerobot_wm.experiment.stage import Checkpoint, Dataset, Stage, lerobot_wm
 from lerobot_wm.system import parts_folder, shards_folder
-from lerobot_wm.train.resume import goes_on
+from lerobot_wm.train.resume import can_resume
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class Plan:
             artefact=final / TRAINING_STATE_DIR / OPTIMIZER_PARAM_GROUPS,
             needs=(dataset.made_by,),
             checkpoint=last,
-            is_there=goes_on,
+            is_there=can_resume,
             resume_argv=lerobot_wm("train", {"config_path": last, "resume": "true", **places}),
         )
         return Checkpoint(stage, final / PRETRAINED_MODEL_DIR)

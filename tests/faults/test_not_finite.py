@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot_wm.train.accelerator import DivergenceError, LossWatch
 from torch import nn
 from torch.utils.data import DataLoader
 
@@ -19,7 +20,6 @@ from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.source import DatasetError
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.train.accelerator import DivergenceError, LossWatch
 from tests.faults.breakage import DATA, set_value
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
 
