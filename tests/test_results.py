@@ -5,6 +5,7 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_wm.envs.tasks import resolve_tasks
@@ -13,8 +14,13 @@ from lerobot_wm.report.command import ReportConfig, report
 from lerobot_wm.statistics import in_split, success_rate
 
 ROOT = Path(__file__).resolve().parents[1]
-RATE_BEFORE = ROOT / "results" / "cpu" / "constant_rate"  # float32 was compared with these rollouts
 TASKS = sorted(resolve_tasks("mt6"))  # the order of the columns
+
+
+def trial(preset: str, name: str) -> list[dict]:
+    """The rollouts of one trial of a preset."""
+    path = ROOT / "results" / preset / "trials.parquet"
+    return pq.read_table(path, filters=[("trial", "==", name)]).to_pylist()
 
 
 def shown(preset: str) -> dict[str, list[str]]:
@@ -35,7 +41,9 @@ def expected(records: list[Record]) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize(("preset", "name"), [("cpu", "records.jsonl"), ("best", "records_set44.jsonl")])
+@pytest.mark.parametrize(
+    ("preset", "name"), [("cpu", "records.jsonl.gz"), ("best", "records_set44.jsonl.gz")]
+)
 def test_readme_shows_the_committed_rollouts(preset: str, name: str) -> None:
     records = read_records([ROOT / "results" / preset / name])
     table = shown(preset)
@@ -47,11 +55,10 @@ def test_readme_shows_the_committed_rollouts(preset: str, name: str) -> None:
 @pytest.mark.parametrize(
     ("preset", "records", "tables"),
     [
-        ("cpu", "records.jsonl", "success.md"),
-        ("cpu/constant_rate", "records.jsonl", "success.md"),
-        ("best", "records.jsonl", "success.md"),
-        ("best", "records_set44.jsonl", "success_set44.md"),
-        ("mt10", "records.jsonl", "success.md"),
+        ("cpu", "records.jsonl.gz", "success.md"),
+        ("best", "records.jsonl.gz", "success.md"),
+        ("best", "records_set44.jsonl.gz", "success_set44.md"),
+        ("mt10", "records.jsonl.gz", "success.md"),
     ],
 )
 def test_the_tables_are_those_of_the_committed_rollouts(
@@ -91,7 +98,7 @@ def test_the_pages_show_the_measured_quality(preset: str) -> None:
 
 
 def test_the_rates_of_mt10_are_those_of_the_committed_rollouts() -> None:
-    records = read_records([ROOT / "results" / "mt10" / "records.jsonl"])
+    records = read_records([ROOT / "results" / "mt10" / "records.jsonl.gz"])
     readme = (ROOT / "README.md").read_text().split("**MT10**")[1].split("\n\n")[0].replace("%", "")
     page = (ROOT / "results" / "mt10" / "README.md").read_text().split("| task |")[1].split("\n\n")[0]
     arms = [cell.strip(" `") for cell in page.splitlines()[0].split("|")[:-1]]
@@ -148,10 +155,10 @@ def test_the_page_of_benchmarks_shows_the_measured_memory() -> None:
 
 
 def test_precision_page_shows_the_committed_trainings_and_rollouts() -> None:
-    script = runpy.run_path(str(ROOT / "scripts" / "compare_precision.py"))
     folder = ROOT / "results" / "precision"
+    script = runpy.run_path(str(folder / "compare_precision.py"))
     document = json.loads((folder / "precision.json").read_text())
-    half = [r for r in read_records([RATE_BEFORE / "records.jsonl"]) if r["seed"] == 0]
-    assert script["success"](half, read_records([folder / "records_float32.jsonl"])) == document["success"]
+    half = [record for record in trial("cpu", "constant_rate") if record["seed"] == 0]
+    assert script["success"](half, read_records([folder / "records_float32.jsonl.gz"])) == document["success"]
     page = (folder / "README.md").read_text()
     assert all(table in page for table in script["tables"](document).split("\n\n"))

@@ -1,8 +1,9 @@
-"""Which of reach's unseen goals are missed: success by the goal's height above the table.
+"""Success on reach's unseen goals, by the goal's height above the table.
 
-    python scripts/reach_heights.py --records=results/best/records.jsonl --variation_set=42    (a second)
+    python results/analysis/reach_heights.py --records=results/best/records.jsonl.gz --variation_set=42
 
-The hand starts about 20 cm above the table. Of the ten goals of the demonstrations one is higher than 25 cm.
+Takes a second. The hand starts about 20 cm above the table. One of the ten goals in the demonstrations is higher
+than 25 cm.
 """
 
 import argparse
@@ -19,12 +20,12 @@ EDGES_CM = (5, 10, 15, 20, 25, 30)
 
 
 def height_cm(record: Record, variation_set: int) -> float:
-    """The goal's height in cm."""
+    """The height of a rollout's goal above the table, in cm."""
     return 100 * float(rand_vec(TASK, record["variation"], variation_set)[5])
 
 
 def main() -> None:
-    """Print a row for each arm."""
+    """Print one row per arm."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,12 +1,12 @@
-"""Whether a world model's latents hold reach's goal because it was seen, or because the demonstrator's actions told it.
+"""Do latents know reach's goal from the images, or from the demonstrator's actions?
 
-    python scripts/reach_latents.py --demonstrations=outputs/best/seed_0/latents_wm_rssm --others=LATENTS_OF_SET_43 \
+    python results/analysis/reach_latents.py --demonstrations=LATENTS --others=LATENTS_OF_SET_43 \
         --output=results/analysis/reach_latents.json
 
-Both are latent datasets of the same world model (`lerobot-wm encode`): the demonstrations of the variations that are
-trained on, and demonstrations of the 50 variations of set 43. A linear regression reads the goal's place from the hand.
-At an episode's first frame the goal is in the image and no action has been made: what is read there was seen. Later
-frames follow actions, each of which is the demonstrator's way to the goal and noise. Seconds on one core.
+Both flags name latent datasets that `lerobot-wm encode` made with the same world model: of the training demonstrations,
+and of demonstrations on the 50 variations of set 43. A linear regression predicts the vector from the hand to the goal.
+At an episode's first frame no action has been taken, so whatever the regression finds there comes from the image. Later
+frames follow actions, and each action is the demonstrator's way to the goal plus noise. Takes seconds on one core.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.records import provenance
 
-PENALTY = 1e-2  # of the ridge regression, per frame and for features of unit variance
+PENALTY = 1e-2  # Of the ridge regression, per frame, for features of unit variance.
 FRAMES = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 30), (30, 60))  # of an episode: from, to before
 
 
@@ -39,9 +39,9 @@ class Frames:
 
     Args:
         latents: s_t, (N, L).
-        blind: What a policy knows that sees nothing: the hand's place, the frame's number, and their squares, (N, 8).
-        way: From the hand to the goal (cm), (N, 3).
-        numbers: How many frames into its episode each is, (N,).
+        blind: What a blind policy knows: hand position, frame number, and their squares, (N, 8).
+        way: Vector from the hand to the goal in cm, (N, 3).
+        numbers: Index of each frame in its episode, (N,).
     """
 
     latents: Tensor
@@ -51,7 +51,7 @@ class Frames:
 
 
 def read(root: Path) -> Frames:
-    """Reach's frames of a latent dataset."""
+    """Read reach's frames of a latent dataset."""
     dataset = LeRobotDataset("local/reach", root=root)
     table = dataset.hf_dataset.with_format("numpy")
     of_task = table["task_index"][:] == dataset.meta.tasks.loc[task_description(TASK), "task_index"]
@@ -65,18 +65,18 @@ def read(root: Path) -> Frames:
     return Frames(column(OBS_LATENT), torch.cat([known, known**2], dim=1), way, numbers)
 
 
-def reading(x: Tensor, y: Tensor, others: Tensor) -> Tensor:
-    """`y` (N, 3) for others (M, F), by a ridge regression fitted to features x (N, F)."""
+def predict(x: Tensor, y: Tensor, others: Tensor) -> Tensor:
+    """Predict targets (M, 3) for `others` (M, F) by ridge regression from features x (N, F) to y (N, 3)."""
     regression = make_pipeline(StandardScaler(), Ridge(PENALTY * len(x))).fit(x.numpy(), y.numpy())
     return torch.as_tensor(regression.predict(others.numpy()))
 
 
 def main() -> None:
-    """Print and write the table."""
+    """Measure all frame ranges, print the table and write it as JSON."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--demonstrations", type=Path, required=True, help="latents that are learned from")
+    parser.add_argument("--demonstrations", type=Path, required=True, help="latents to fit on")
     parser.add_argument("--others", type=Path, required=True, help="latents of other goals")
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
@@ -86,11 +86,13 @@ def main() -> None:
         for root in (arguments.demonstrations, arguments.others)
     }
     if len(worlds) > 1:
-        parser.error("the two latent datasets are of different world models: encode both with the same")
+        parser.error(
+            "The two latent datasets come from different world models. Encode both with the same one."
+        )
     known, others = read(arguments.demonstrations), read(arguments.others)
     errors = {
-        "latents": reading(known.latents, known.way, others.latents) - others.way,  # (M, 3)
-        "blind": reading(known.blind, known.way, others.blind) - others.way,
+        "latents": predict(known.latents, known.way, others.latents) - others.way,  # (M, 3)
+        "blind": predict(known.blind, known.way, others.blind) - others.way,
     }
     rows = {}
     for start, stop in FRAMES:

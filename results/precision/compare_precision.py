@@ -1,10 +1,10 @@
-"""The same trainings in bfloat16 and in float32: losses, values, and success in closed loop.
+"""Compare runs in bfloat16 and in float32: losses, values and success rates.
 
     scripts/reproduce_table1.py --preset=cpu --arms=wm_iql,wm_bc --seeds=0 --results_dir=outputs/none
     scripts/reproduce_table1.py --preset=cpu_float32
-    python scripts/compare_precision.py --output=results/precision/precision.json       (a minute)
+    python results/precision/compare_precision.py --output=results/precision/precision.json
 
-Prints Markdown tables and writes what they are made of.
+Prints the Markdown tables of the README and writes their numbers as JSON. Takes a minute.
 """
 
 import argparse
@@ -23,15 +23,15 @@ MONITORED = {
     "wm_iql": ("value_loss", "critic_loss", "actor_loss", "q", "v", "advantage"),
     "wm_bc": ("loss",),
 }
-PARTS = 5  # a training's log is averaged over as many parts
+PARTS = 5  # each training log is averaged over five parts of equal length
 
 
 def curves(folder: Path) -> dict[str, dict[str, list[float]]]:
-    """Training -> what it logs -> its mean over each part of the training."""
+    """Return the mean of each logged value over each part of each run."""
     found: dict[str, dict[str, list[float]]] = {}
     for training, names in MONITORED.items():
         log = [json.loads(line) for line in (folder / training / TRAIN_LOG_NAME).read_text().splitlines()]
-        # A training that went on logs a step twice.
+        # A resumed run logs some steps twice.
         by_step = list({line["step"]: line for line in log}.values())
         edges = [round(i * len(by_step) / PARTS) for i in range(PARTS + 1)]
         parts = [by_step[low:high] for low, high in itertools.pairwise(edges)]
@@ -42,13 +42,13 @@ def curves(folder: Path) -> dict[str, dict[str, list[float]]]:
 
 
 def success(half: list[Record], whole: list[Record]) -> dict[str, dict[str, Any]]:
-    """Arm -> success in bfloat16 and float32 and their paired difference."""
+    """Return, for each arm, success in both precisions and the paired difference."""
     found: dict[str, dict[str, Any]] = {}
     for arm in ("wm_iql", "wm_bc"):
         ours, theirs = ([r for r in records if r["arm"] == arm] for records in (half, whole))
         paired = compare(ours, theirs)
         if paired is None:
-            raise ValueError(f"The two runs share no rollout of {arm}: roll it out in both.")
+            raise ValueError(f"The two runs have no rollout of {arm} in common. Evaluate it in both.")
         low, high = paired.interval
         found[arm] = {
             "bfloat16": str(success_rate(ours)),
@@ -61,7 +61,7 @@ def success(half: list[Record], whole: list[Record]) -> dict[str, dict[str, Any]
 
 
 def tables(document: dict[str, Any]) -> str:
-    """The document in Markdown."""
+    """Return the document's two tables in Markdown."""
     fifths = " | ".join(f"{i + 1}/{PARTS}" for i in range(PARTS))
     lines = [f"| training | mean over its part | precision | {fifths} |", "|---|---|---|" + "---:|" * PARTS]
     for training, names in MONITORED.items():
@@ -85,7 +85,7 @@ def tables(document: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Compare two output folders of the experiment."""
+    """Compare the output folders of two presets."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,10 +1,10 @@
-"""Whether memory, open files, threads or OpenGL contexts grow: a training of many short epochs, and many resets.
+"""Check that memory, open files, threads and OpenGL contexts do not grow over a long run.
 
-    python scripts/long_run.py --output=results/faults/long_run.json
+    python results/faults/long_run.py --output=results/faults/long_run.json
 
-A policy is trained by `lerobot-wm train` on two short episodes, a new epoch every few steps, and the environments of
-the paper's six tasks are reset in turn in one process, made anew now and then. What is there after a warm-up is
-compared with what is there at the end.
+Trains a policy with `lerobot-wm train` on two short episodes, so that a new epoch begins every few steps. Then resets
+the environments of the paper's six tasks in turn in one process, and sometimes creates them again. Compares what the
+processes hold after a warm-up with what they hold at the end.
 """
 
 import argparse
@@ -27,14 +27,14 @@ from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.envs.rendering import Renderer
 from lerobot_wm.records import provenance
 
-WARM_UP = 0.2  # of a run; imports, the allocator's pools, the first checkpoint
-MADE_ANEW = 240  # resets after which environments are closed and made again
+WARM_UP = 0.2  # share of a run that covers imports, the allocator's pools and the first checkpoint
+RESETS_PER_ENV = 240  # then the environments are closed and created again
 SECONDS_BETWEEN_SAMPLES = 1.0
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a process holds: resident memory (MB), open files, threads."""
+    """Resident memory (MB), open files and threads of a process."""
 
     memory: float
     files: int
@@ -42,17 +42,17 @@ class Sample:
 
     @classmethod
     def of(cls, process: psutil.Process) -> "Sample":
-        """Look at a living process.
+        """Sample a running process.
 
         Raises:
-            psutil.Error: It has ended.
+            psutil.Error: The process has ended.
         """
         with process.oneshot():
             return cls(process.memory_info().rss / 1e6, process.num_fds(), process.num_threads())
 
 
-def compared(samples: list[Sample]) -> dict[str, Any]:
-    """Medians of the tenth of the samples that follows the warm-up, and of the last tenth; growth of memory between."""
+def compare(samples: list[Sample]) -> dict[str, Any]:
+    """Compare medians of the tenth of the samples after the warm-up with medians of the last tenth."""
     tenth = max(1, len(samples) // 10)
     first = int(WARM_UP * len(samples))
     parts = {"after warm-up": samples[first : first + tenth], "at the end": samples[-tenth:]}
@@ -67,7 +67,7 @@ def compared(samples: list[Sample]) -> dict[str, Any]:
 
 
 def train(folder: Path, steps: int) -> dict[str, Any]:
-    """Train a small policy for many epochs in a process of its own, and watch it."""
+    """Train a small policy for many epochs in a subprocess and sample it every second."""
     lerobot_wm = [sys.executable, "-m", "lerobot_wm.cli"]
     dataset = [f"--root={folder / 'dataset'}", "--repo_id=local/long_run"]
     collect = ["collect", "--tasks=reach-v3", "--episodes_per_task=2", "--image_size=32", "--num_workers=1"]
@@ -84,18 +84,18 @@ def train(folder: Path, steps: int) -> dict[str, Any]:
     with (folder / "train.log").open("w") as log:
         run = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
         while run.poll() is None:
-            if (folder / "run" / "train_log.jsonl").exists():  # steps are being taken
+            if (folder / "run" / "train_log.jsonl").exists():  # training has begun
                 samples.append(Sample.of(psutil.Process(run.pid)))
             time.sleep(SECONDS_BETWEEN_SAMPLES)
     if run.returncode != 0:
-        raise RuntimeError(f"the training failed: {(folder / 'train.log').read_text()[-2000:]}")
+        raise RuntimeError(f"Training failed: {(folder / 'train.log').read_text()[-2000:]}")
     last = json.loads((folder / "run" / "train_log.jsonl").read_text().splitlines()[-1])
     seconds = round(time.monotonic() - start)
-    return {"steps": last["step"], "epochs": round(last["epochs"]), "seconds": seconds, **compared(samples)}
+    return {"steps": last["step"], "epochs": round(last["epochs"]), "seconds": seconds, **compare(samples)}
 
 
 def reset(resets: int) -> dict[str, Any]:
-    """Reset the environments of the six tasks in turn, one step each, in this process."""
+    """Reset the environments of the six tasks in turn in this process, with one step each."""
     envs = [MetaworldMTEnv(task) for task in MT6]
     action = np.zeros(4, np.float32)
     process = psutil.Process()
@@ -105,30 +105,30 @@ def reset(resets: int) -> dict[str, Any]:
         env = envs[i % len(envs)]
         env.reset(seed=i // len(envs))
         env.step(action)
-        if i % MADE_ANEW == MADE_ANEW - 1:
-            contexts.add(living_contexts())
+        if i % RESETS_PER_ENV == RESETS_PER_ENV - 1:
+            contexts.add(count_contexts())
             for env in envs:
                 env.close()
-            contexts.add(living_contexts())
+            contexts.add(count_contexts())
         samples.append(Sample.of(process))
     for env in envs:
         env.close()
     seconds = round(time.monotonic() - start)
-    return {"resets": resets, "seconds": seconds, "contexts": sorted(contexts), **compared(samples)}
+    return {"resets": resets, "seconds": seconds, "contexts": sorted(contexts), **compare(samples)}
 
 
-def living_contexts() -> int:
-    """Renderers of this process, each with its context of MuJoCo's in OpenGL's memory."""
+def count_contexts() -> int:
+    """Count the renderers of this process; each has one OpenGL context."""
     gc.collect()
     return sum(type(thing) is Renderer for thing in gc.get_objects())
 
 
 def main() -> None:
-    """Run both and write what they held."""
+    """Run both, print and write the samples."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=20_000, help="of training")
+    parser.add_argument("--steps", type=int, default=20_000, help="training steps")
     parser.add_argument("--resets", type=int, default=2_000)
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()

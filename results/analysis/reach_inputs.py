@@ -1,9 +1,10 @@
-"""Which inputs let reach generalise from ten goals, were they known exactly: imitation from the simulator's numbers.
+"""Which exact inputs let imitation of reach generalise from ten goals to all fifty.
 
-    python scripts/reach_inputs.py --dataset=outputs/cpu/dataset --output=results/analysis/reach_inputs.json
+    python results/analysis/reach_inputs.py --dataset=outputs/cpu/dataset --output=results/analysis/reach_inputs.json
 
-For each set of inputs a small network learns reach's demonstrations by squared error, and is rolled out on the 50
-variations of set 43 with Gaussian noise of several sizes on its actions. No image is drawn: minutes on one core.
+For each set of inputs, taken from the simulator's state, a small network imitates reach's demonstrations by squared
+error. It is then rolled out on the 50 variations of set 43 with Gaussian noise on its actions. Nothing is rendered, so
+this takes minutes on one core.
 """
 
 import argparse
@@ -37,25 +38,27 @@ STEPS, BATCH_SIZE, LR = 4000, 256, 1e-3
 HAND, GRIPPER, PUCK, GOAL = slice(0, 3), slice(3, 4), slice(4, 7), slice(36, 39)
 
 
-def joined(*parts: Tensor) -> Tensor:
-    """Parts (..., n_i) side by side, (..., sum of n_i)."""
+def concatenate(*parts: Tensor) -> Tensor:
+    """Concatenate parts (..., n_i) along their last dimension."""
     return torch.cat(parts, dim=-1)
 
 
 INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "goal from the hand": lambda s: s[..., GOAL] - s[..., HAND],
-    "goal, hand and gripper": lambda s: joined(s[..., GOAL], s[..., HAND], s[..., GRIPPER]),
-    "goal and puck from the hand": lambda s: joined(s[..., GOAL] - s[..., HAND], s[..., PUCK] - s[..., HAND]),
-    "goal, puck, hand and gripper": lambda s: joined(
+    "goal, hand and gripper": lambda s: concatenate(s[..., GOAL], s[..., HAND], s[..., GRIPPER]),
+    "goal and puck from the hand": lambda s: concatenate(
+        s[..., GOAL] - s[..., HAND], s[..., PUCK] - s[..., HAND]
+    ),
+    "goal, puck, hand and gripper": lambda s: concatenate(
         s[..., GOAL], s[..., PUCK], s[..., HAND], s[..., GRIPPER]
     ),
     "all 39 numbers": lambda s: s,
-    "hand and gripper (blind)": lambda s: joined(s[..., HAND], s[..., GRIPPER]),
+    "hand and gripper (blind)": lambda s: concatenate(s[..., HAND], s[..., GRIPPER]),
 }
 
 
-def demonstrations(root: Path) -> tuple[Tensor, Tensor]:
-    """States (N, 39) and actions (N, 4) of reach's demonstrations."""
+def read_demonstrations(root: Path) -> tuple[Tensor, Tensor]:
+    """Return states (N, 39) and actions (N, 4) of reach's demonstrations."""
     dataset = LeRobotDataset("local/reach", root=root)
     frames = dataset.hf_dataset.with_format("numpy")
     of_task = frames["task_index"][:] == dataset.meta.tasks.loc[task_description(TASK), "task_index"]
@@ -64,15 +67,15 @@ def demonstrations(root: Path) -> tuple[Tensor, Tensor]:
 
 
 def imitate(x: Tensor, actions: Tensor) -> Callable[[Tensor], Tensor]:
-    """A policy fitted by squared error to inputs (N, I) and actions (N, A)."""
+    """Fit a policy by squared error to inputs (N, I) and actions (N, A)."""
     torch.manual_seed(0)
     mean, std = x.mean(0), x.std(0) + 1e-6
     network = MLP(x.shape[1], [256, 256], actions.shape[1], activation=nn.ReLU)
     optimizer = torch.optim.Adam(network.parameters(), lr=LR)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
     for _ in range(STEPS):
-        picked = torch.randint(len(x), (BATCH_SIZE,))
-        loss = nn.functional.mse_loss(network((x[picked] - mean) / std), actions[picked])
+        batch = torch.randint(len(x), (BATCH_SIZE,))
+        loss = nn.functional.mse_loss(network((x[batch] - mean) / std), actions[batch])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -81,13 +84,13 @@ def imitate(x: Tensor, actions: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 @torch.no_grad()
-def successes(
+def count_successes(
     simulation: Simulation,
     policy: Callable[[Tensor], Tensor],
     inputs: Callable[[Tensor], Tensor],
     noise: float,
 ) -> int:
-    """Goals reached, of the 50 variations."""
+    """Count the goals that the policy reaches on the 50 variations."""
     rng = np.random.default_rng(0)
     reached = 0
     for variation in range(NUM_VARIATIONS):
@@ -103,20 +106,22 @@ def successes(
 
 
 def main() -> None:
-    """Print and write the table."""
+    """Measure all inputs, print the table and write it as JSON."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--dataset", type=Path, required=True, help="folder of the collected mt6 dataset")
+    parser.add_argument("--dataset", type=Path, required=True, help="folder of the mt6 demonstrations")
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     register_third_party_plugins()
-    states, actions = demonstrations(arguments.dataset)
+    states, actions = read_demonstrations(arguments.dataset)
     simulation = Simulation(TASK, SELECTION_VARIATION_SET)
     rows = {}
     for name, inputs in INPUTS.items():
         policy = imitate(inputs(states), actions)
-        rows[name] = {f"noise {noise}": successes(simulation, policy, inputs, noise) for noise in NOISES}
+        rows[name] = {
+            f"noise {noise}": count_successes(simulation, policy, inputs, noise) for noise in NOISES
+        }
         print(f"{name:30s} {rows[name]}", flush=True)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(

@@ -1,15 +1,14 @@
-"""How well cameras can tell where reach's goal is, whatever the model: exact pixel positions, ten goals to learn from.
+"""How well each set of cameras can locate reach's goal, given exact pixel positions of ten goals.
 
-    python scripts/reach_views.py --output=results/analysis/reach_views.json        (seconds)
+    python results/analysis/reach_views.py --output=results/analysis/reach_views.json
 
-For each set of cameras, the goal's exact pixel coordinates in every view are the input of a linear regression that
-is fitted on the ten seen variations and asked for the goals of the forty unseen ones. With one view the depth along
-its line of sight is missing, and ten goals cannot make up for it.
+For each set of cameras, a linear regression maps the goal's pixel coordinates in every view to its position. It is
+fitted on the ten seen variations and predicts the goals of the forty unseen ones. A single view lacks the depth along
+its line of sight, and ten goals are too few to learn it. Takes seconds.
 
 Reach succeeds when the point between the fingers comes within 5 cm of the goal. The expert steers the *hand* to the
-goal, and that point hangs 4.5 cm below the hand: demonstrations end 5 mm inside the sphere's lower edge. A policy that
-imitates them succeeds if its way, taken as the straight line from the hand's start to where it believes the goal is,
-enters the sphere.
+goal, and that point is 4.5 cm below the hand. So the demonstrations end 5 mm inside the sphere's lower edge. Here an
+imitating policy moves the hand on a straight line to the predicted goal, and succeeds if the fingers enter the sphere.
 """
 
 import argparse
@@ -38,41 +37,41 @@ VIEWS = (
 )
 
 
-def pixels(simulation: Simulation, camera: str, points: np.ndarray) -> np.ndarray:
-    """Pixel coordinates (N, 2) of points (N, 3), relative to the centre of a 64x64 image."""
+def project(simulation: Simulation, camera: str, points: np.ndarray) -> np.ndarray:
+    """Return pixel coordinates (N, 2) of points (N, 3), relative to the centre of a 64x64 image."""
     pose = simulation.data.camera(camera)
     field_of_view = np.radians(simulation.model.camera(camera).fovy[0])
     in_camera = (points - pose.xpos) @ pose.xmat.reshape(3, 3)  # (N, 3), the camera looks along -z
     return in_camera[:, :2] / -in_camera[:, 2:] * (IMAGE_SIZE / 2) / np.tan(field_of_view / 2)
 
 
-def predicted_goals(inputs: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """Goals (40, 3) that a linear regression on the seen variations predicts for the unseen ones."""
+def predict_goals(inputs: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """Predict the unseen goals (40, 3) by linear regression from the seen variations."""
     seen, unseen = slice(NUM_SEEN_VARIATIONS), slice(NUM_SEEN_VARIATIONS, None)
     return LinearRegression().fit(inputs[seen], goals[seen]).predict(inputs[unseen])
 
 
 def succeeds(aims: np.ndarray, goals: np.ndarray, hand: np.ndarray, fingers: np.ndarray) -> np.ndarray:
-    """Whether fingers that move on straight lines, until the hand is at its aim, come within 5 cm of the goals.
+    """Say whether the fingers come within 5 cm of the goals while the hand moves straight to its aim.
 
     Args:
-        aims: Where the hand goes, (N, 3).
-        goals: (N, 3).
-        hand: Where it starts, (3,).
-        fingers: Position of the point between the fingers relative to the hand, (3,).
+        aims: End points of the hand, (N, 3).
+        goals: Positions of the goals, (N, 3).
+        hand: Start of the hand, (3,).
+        fingers: Point between the fingers relative to the hand, (3,).
 
     Returns:
         (N,) bool.
     """
     way = aims - hand  # (N, 3)
     to_goal = goals - fingers - hand  # (N, 3)
-    share = (way * to_goal).sum(1) / (way * way).sum(1)  # of the way, at its point nearest to the goal
+    share = (way * to_goal).sum(1) / (way * way).sum(1)  # of the way, where it is nearest to the goal
     nearest = way * share.clip(0, 1)[:, None]
     return np.linalg.norm(nearest - to_goal, axis=1) <= SUCCESS_RADIUS
 
 
 def main() -> None:
-    """Print and write the table."""
+    """Measure all views, print the table and write it as JSON."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -86,8 +85,8 @@ def main() -> None:
     unseen = goals[NUM_SEEN_VARIATIONS:]  # (40, 3)
 
     def summary(draws: list[np.ndarray]) -> dict[str, float]:
-        """Mean error of the predicted goals and share of successes over draws of the inputs, (50, n) each."""
-        aims = [predicted_goals(inputs, goals) for inputs in draws]
+        """Average error and success over draws of the inputs, (50, n) each."""
+        aims = [predict_goals(inputs, goals) for inputs in draws]
         distances = [np.linalg.norm(aim - unseen, axis=1) for aim in aims]
         reached = [succeeds(aim, unseen, hand, fingers) for aim in aims]
         return {
@@ -101,7 +100,7 @@ def main() -> None:
         "no image (mean of the seen goals)": {"exact": summary([np.zeros((len(goals), 1))])},
     }
     for views in VIEWS:
-        exact = np.hstack([pixels(simulation, view, goals) for view in views])  # (50, 2·views)
+        exact = np.hstack([project(simulation, view, goals) for view in views])  # (50, 2·views)
         noisy = [exact + rng.normal(0, PIXEL_NOISE, exact.shape) for _ in range(NOISE_DRAWS)]
         rows[" + ".join(views)] = {"exact": summary([exact]), "half_pixel_noise": summary(noisy)}
     for name, row in rows.items():

@@ -1,10 +1,10 @@
-"""Arithmetic of a world model's training step, and how near to the machine's peak it runs.
+"""Arithmetic operations of a world model's training step, and how close it runs to the machine's peak.
 
-    python scripts/world_model_flops.py --output=results/cpu/world_model_flops.json
+    python results/analysis/world_model_flops.py --output=results/analysis/world_model_flops.json
 
-Operations of matrix products and convolutions are counted (PyTorch's FlopCounterMode: a multiply-add is two), forward
-and backward, for the batch of `configs/cpu/wm_rssm.json`. The peak is what a large matrix product of the training's
-number type reaches on one thread, measured in turn with the step.
+Counts matrix products and convolutions, forward and backward, for the batch of preset `cpu` (PyTorch's
+FlopCounterMode: a multiply-add counts as two). The peak is the speed of a large matrix product in the same number type
+on one thread; both are timed alternately.
 """
 
 import argparse
@@ -26,14 +26,14 @@ from lerobot_wm.system import keep_freed_memory
 from lerobot_wm.world_model.config import RSSMConfig
 from lerobot_wm.world_model.model import WorldModel
 
-BATCH, LENGTH = 16, 25  # configs/cpu/wm_rssm.json, WMRSSMConfig
+BATCH, LENGTH = 16, 25  # of preset cpu
 DECODE_SHARES = (1.0, 0.6, 0.2)
 MATRIX = 2048
 ROUNDS = 10
 
 
-def training_step(decode_share: float, dtype: torch.dtype) -> Callable[[], None]:
-    """Loss and gradients of a world model of the default sizes, on random windows of B x T frames."""
+def make_step(decode_share: float, dtype: torch.dtype) -> Callable[[], None]:
+    """Make a function that computes loss and gradients of a default world model on random windows (B, T)."""
     torch.manual_seed(0)
     model = WorldModel(RSSMConfig(image_channels=3, action_dim=ACTION_DIM, decode_share=decode_share))
     images = torch.rand(BATCH, LENGTH, 3, IMAGE_SIZE, IMAGE_SIZE)
@@ -50,9 +50,9 @@ def training_step(decode_share: float, dtype: torch.dtype) -> Callable[[], None]
     return step
 
 
-def counted(decode_share: float) -> dict[str, float]:
-    """GFLOP of a step: in all, and of the image encoder and decoder."""
-    step = training_step(decode_share, torch.float32)
+def count_gflop(decode_share: float) -> dict[str, float]:
+    """Count the GFLOP of a step: total, image encoder, image decoder."""
+    step = make_step(decode_share, torch.float32)
     with FlopCounterMode(display=False) as counter:
         step()
     counts = counter.get_flop_counts()
@@ -60,20 +60,20 @@ def counted(decode_share: float) -> dict[str, float]:
     return {name: sum(counts[module].values()) / 1e9 for name, module in parts.items()}
 
 
-def seconds(call: Callable[[], Any]) -> float:
-    """Wall time of one call."""
+def time_call(call: Callable[[], Any]) -> float:
+    """Return the wall time of one call in seconds."""
     started = time.perf_counter()
     call()
     return time.perf_counter() - started
 
 
-def measured(gflop: float, dtype: torch.dtype) -> dict[str, float | str]:
-    """GFLOP/s of the step and of a matrix product, one thread, medians of alternating calls."""
+def measure_speed(gflop: float, dtype: torch.dtype) -> dict[str, float | str]:
+    """Measure GFLOP/s of the step and of a matrix product on one thread; medians of alternating calls."""
     torch.set_num_threads(1)
-    step = training_step(1.0, dtype)
+    step = make_step(1.0, dtype)
     left, right = torch.randn(2, MATRIX, MATRIX).to(dtype)
-    step(), left @ right  # the first calls also choose algorithms and take memory
-    pairs = [(seconds(step), seconds(lambda: left @ right)) for _ in range(ROUNDS)]
+    step(), left @ right  # warm-up
+    pairs = [(time_call(step), time_call(lambda: left @ right)) for _ in range(ROUNDS)]
     of_step, of_product = (statistics.median(times) for times in zip(*pairs, strict=True))
     return {
         "dtype": str(dtype),
@@ -84,19 +84,19 @@ def measured(gflop: float, dtype: torch.dtype) -> dict[str, float | str]:
 
 
 def main() -> None:
-    """Count, measure, write and print."""
+    """Count, measure, write the JSON file and print it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--output", type=Path, required=True)
     output: Path = parser.parse_args().output
-    keep_freed_memory()  # as a training does
-    gflop = {str(share): counted(share) for share in DECODE_SHARES}
+    keep_freed_memory()  # as `lerobot-wm train` does
+    gflop = {str(share): count_gflop(share) for share in DECODE_SHARES}
     dtype = getattr(torch, str(WMRSSMConfig(device="cpu").dtype))
     result = {
         "batch": [BATCH, LENGTH],
         "gflop_by_decode_share": gflop,
-        "one_thread": measured(gflop["1.0"]["all"], dtype),
+        "one_thread": measure_speed(gflop["1.0"]["all"], dtype),
         "provenance": provenance(),
     }
     output.parent.mkdir(parents=True, exist_ok=True)
