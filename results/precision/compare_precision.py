@@ -63,7 +63,7 @@ def success(half: list[Record], whole: list[Record]) -> dict[str, dict[str, Any]
 def tables(document: dict[str, Any]) -> str:
     """Return the document's two tables in Markdown."""
     fifths = " | ".join(f"{i + 1}/{PARTS}" for i in range(PARTS))
-    lines = [f"| training | mean over its part | precision | {fifths} |", "|---|---|---|" + "---:|" * PARTS]
+    lines = [f"| run | mean over each fifth | precision | {fifths} |", "|---|---|---|" + "---:|" * PARTS]
     for training, names in MONITORED.items():
         for name in names:
             for precision in ("bfloat16", "float32"):
