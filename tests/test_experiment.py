@@ -1,5 +1,6 @@
 """From stages to records: finished arms are recorded once, failed ones are named, committed ones are not run."""
 
+import gzip
 import json
 import sys
 from dataclasses import replace
@@ -87,7 +88,9 @@ def committed(tmp_path: Path) -> Path:
     """A folder where wm_bc's records are committed and everything else of it is gone."""
     run(tmp_path, [("wm_bc", 0)])
     (tmp_path / "results").mkdir()
-    (tmp_path / "outputs" / "own_records.jsonl").rename(tmp_path / "results" / "records.jsonl")
+    own = tmp_path / "outputs" / "own_records.jsonl"
+    (tmp_path / "results" / "records.jsonl.gz").write_bytes(gzip.compress(own.read_bytes()))
+    own.unlink()
     (tmp_path / "outputs" / "wm_bc_0" / "done").unlink()
     return tmp_path
 
@@ -106,7 +109,7 @@ def test_what_is_taken_from_committed_records_is_named(committed: Path) -> None:
         arms.tell_committed(Console(file=file, width=200))
         file.seek(0)
         [line] = file.read().replace("\n", "").splitlines()
-    assert f"taken from {committed / 'results' / 'records.jsonl'}: wm_bc 0 (arm and seed)" in line
+    assert f"taken from {committed / 'results' / 'records.jsonl.gz'}: wm_bc 0 (arm and seed)" in line
     assert "--results_dir=outputs/none runs them" in line
 
 
