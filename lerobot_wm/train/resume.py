@@ -51,13 +51,12 @@ def restore_last(config_path: str) -> None:
         )
 
 
-def goes_on(config_path: Path) -> bool:
-    """Whether a training goes on from `.../checkpoints/last/pretrained_model/train_config.json`.
-
-    The link is set again where a kill fell between its removal and its setting.
-    """
+def can_resume(config_path: Path) -> bool:
+    """Whether training can resume from `.../checkpoints/last/pretrained_model/train_config.json`; writes nothing."""
     link = _link_of(config_path)
-    return (link is None or _is_set(link)) and config_path.exists()
+    if link is None or link.exists():
+        return config_path.exists()
+    return any(map(is_whole, _numbered(link.parent)))
 
 
 def clear_unfinished(checkpoint: Path, output_dir: Path) -> None:
