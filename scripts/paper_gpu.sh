@@ -4,10 +4,10 @@
 #
 #   scripts/paper_gpu.sh          the preset `paper`
 #   scripts/paper_gpu.sh smoke    the same path in minutes on two CPU cores
-#   LIMIT=540 scripts/paper_gpu.sh    stops after so many seconds, and keeps what there is by then
+#   LIMIT=540 scripts/paper_gpu.sh    stops after this many seconds, and keeps the results so far
 #
-# The work goes to outputs/<preset>, what is worth keeping to $OUT (outputs/paper_gpu/<preset> by default). Called again
-# it goes on where it stopped. PYTHON names an interpreter that has the project installed, to use in place of .venv.
+# All outputs go to outputs/<preset>, a copy of the results to $OUT (default: outputs/paper_gpu/<preset>). Run it again to
+# resume. PYTHON names an interpreter to use instead of .venv; it must have the project installed.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 unset PYTHONDONTWRITEBYTECODE
@@ -20,17 +20,17 @@ if [[ -z "${PYTHON:-}" ]]; then
 fi
 if [[ "$PRESET" != smoke ]] && ! "$PYTHON" -c "import sys, torch; sys.exit(not torch.cuda.is_available())"; then
   "$PYTHON" -m lerobot_wm.cli doctor || true
-  echo "PyTorch finds no GPU, on which the preset '$PRESET' takes minutes and without one days: see above." >&2
+  echo "PyTorch finds no GPU (see above). The preset '$PRESET' takes minutes on a GPU and days without one." >&2
   exit 1
 fi
 mkdir -p "$OUT"
 
-# Records that were committed do not count here: the machine is to do the work.
+# Do not count committed records, so that everything runs on this machine.
 status=0
 ${LIMIT:+timeout "$LIMIT"} "$PYTHON" scripts/reproduce_table1.py --preset="$PRESET" --arms=wm_bc,wm_iql --seeds=0 \
   --results_dir="$OUT/none" || status=$?
 
-# Stopped before its end, it has its own records and the logs of its trainings alone.
+# If stopped early, there are only own_records.jsonl and the training logs.
 for file in own_records.jsonl records.jsonl times.json report/index.html report/success.md report/open_loop.png; do
   if [[ -e "outputs/$PRESET/$file" ]]; then
     cp "outputs/$PRESET/$file" "$OUT/"
@@ -50,7 +50,7 @@ from pathlib import Path
 from lerobot_wm.records import provenance
 
 preset, seconds, file = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
-if file.is_file():  # of a call that this one went on from
+if file.is_file():  # from the call that this one resumes
     seconds += json.loads(file.read_text())["wall_seconds"]
 record = {**provenance(), "command": f"scripts/paper_gpu.sh {preset}", "wall_seconds": seconds}
 file.write_text(json.dumps(record, indent=2) + "\n")

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # The whole path on one small machine: demonstrations, world model, latents, policies, rollouts, report; 8 to 12 minutes on
-# two cores. It is scripts/reproduce_table1.py at the sizes of configs/quickstart/: ten rollouts of each task, on five seen
+# two cores. It is scripts/reproduce_table1.py at the sizes of configs/quickstart.json: ten rollouts of each task, on five seen
 # and five unseen variations.
 #
-# Safe to stop and run again: finished stages are skipped, trainings go on from their last checkpoint. To start from
-# nothing, remove outputs/quickstart.
+# You can stop it and run it again: finished stages are skipped, training resumes from its last checkpoint. To start over,
+# remove outputs/quickstart.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # Without bytecode files, which this variable forbids, each command spends 7 s more on its imports.

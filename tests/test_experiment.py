@@ -1,6 +1,7 @@
-"""From stages to records: finished arms are recorded once, failed ones are named, committed ones are not run."""
+"""From stages to records: finished arms are recorded once, failed ones are named, committed ones do not run."""
 
 import gzip
+import io
 import json
 import sys
 from dataclasses import replace
@@ -9,13 +10,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from lerobot_wm.experiment.arms import ARMS, Arm
 from lerobot_wm.experiment.experiment import Experiment
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import load_preset
-from lerobot_wm.experiment.reproduce import exclusive, main, show_failures
+from lerobot_wm.experiment.reproduce import hold_lock, main, show_failures
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.records import read_records
+from lerobot_wm.report.arms import ARMS, Arm
 
 # Writes the two rollouts of an arm: python -c ROLL_OUT FOLDER ARM SEED
 ROLL_OUT = """
@@ -32,7 +33,7 @@ lines = [json.dumps({**record, "variation": k}) for k in (0, 1)]
 
 
 class QuickPlan(Plan):
-    """Arms whose rollouts take no training."""
+    """Arms whose rollouts need no training."""
 
     def evaluations(self, arm: Arm, seed: int) -> list[Stage]:
         folder = self.output_dir / f"{arm.name}_{seed}"
@@ -50,7 +51,7 @@ def run(folder: Path, arms: list[tuple[str, int]]) -> tuple[list[Stage], str]:
     """Run these arms; returns what failed and what was printed."""
     with (folder / "printed").open("w+") as file:
         console = Console(file=file, width=200)
-        with exclusive(folder / "outputs") as lock:
+        with hold_lock(folder / "outputs") as lock:
             failed = experiment(folder, arms).run(lock, console)
         show_failures(failed, console)
         file.seek(0)
@@ -85,7 +86,7 @@ def test_rollouts_that_a_killed_run_left_behind_are_recorded(tmp_path: Path) -> 
 
 @pytest.fixture
 def committed(tmp_path: Path) -> Path:
-    """A folder where wm_bc's records are committed and everything else of it is gone."""
+    """A folder where wm_bc's records are committed and its outputs are gone."""
     run(tmp_path, [("wm_bc", 0)])
     (tmp_path / "results").mkdir()
     own = tmp_path / "outputs" / "own_records.jsonl"
@@ -102,40 +103,42 @@ def test_committed_records_count_as_done(committed: Path) -> None:
     assert list(times) == ["wm_bc_0"]
 
 
-def test_what_is_taken_from_committed_records_is_named(committed: Path) -> None:
-    """Changed settings would have no effect on it."""
+def test_arms_whose_records_are_committed_are_named(committed: Path) -> None:
+    """Changed settings have no effect on them."""
     with (committed / "printed").open("w+") as file:
         arms = experiment(committed, [("wm_bc", 0), ("wm_bc", 1)])
-        arms.tell_committed(Console(file=file, width=200))
+        arms.name_committed(Console(file=file, width=200))
         file.seek(0)
-        [line] = file.read().replace("\n", "").splitlines()
-    assert f"taken from {committed / 'results' / 'records.jsonl.gz'}: wm_bc 0 (arm and seed)" in line
-    assert "--results_dir=outputs/none runs them" in line
+        printed = file.read().replace("\n", "")
+    for fact in (str(committed / "results" / "records.jsonl.gz"), "wm_bc 0", "--results_dir"):
+        assert fact in printed
+    assert "wm_bc 1" not in printed
 
 
-def test_list_says_what_is_done_and_what_is_left(committed: Path) -> None:
-    with (committed / "printed").open("w+") as file:
+def test_list_shows_what_is_done_and_what_is_left_and_writes_nothing(committed: Path) -> None:
+    before = sorted(committed.rglob("*"))
+    with io.StringIO() as file:
         experiment(committed, [("wm_bc", 0), ("wm_bc", 1)]).show(Console(file=file, width=80))
-        file.seek(0)
-        lines = [" ".join(line.split()) for line in file.read().splitlines()]
+        lines = [" ".join(line.split()) for line in file.getvalue().splitlines()]
+    assert sorted(committed.rglob("*")) == before
     assert "wm_bc, seed 0 records complete" in lines
     assert any(line.startswith("wm_bc_1 to run") for line in lines)
     assert lines[-1].startswith("Stages to run: 1, about")
 
 
 @pytest.mark.parametrize(
-    ("flags", "message"),
+    ("flags", "facts"),
     [
-        ("--preset=huge", "No preset 'huge'.*there are .*cpu"),
-        ("--preset=smoke --arms=wm_cb", "No arm 'wm_cb'"),
-        ("--preset=smoke --processes=0", "expected at least 1"),
+        ("--preset=huge", "'huge'.*cpu"),
+        ("--preset=smoke --arms=wm_cb", "'wm_cb'.*wm_bc"),
+        ("--preset=smoke --processes=0", "--processes=0"),
     ],
 )
 def test_bad_flags_are_refused_before_work_starts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, message: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, facts: str
 ) -> None:
     output_dir = tmp_path / "outputs"
     monkeypatch.setattr(sys, "argv", ["reproduce_table1.py", f"--output_dir={output_dir}", *flags.split()])
-    with pytest.raises(SystemExit, match=message):
+    with pytest.raises(SystemExit, match=facts):
         main()
     assert not output_dir.exists()

@@ -1,7 +1,6 @@
 """Presets and arms as stages: what needs what, and that every command line is understood by its command."""
 
 import json
-import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +18,12 @@ from lerobot_wm.commands.relabel import RelabelConfig
 from lerobot_wm.constants import MT6
 from lerobot_wm.encode.command import EncodeConfig
 from lerobot_wm.evaluate.config import EvaluateConfig
-from lerobot_wm.experiment.arms import ARMS, Arm
 from lerobot_wm.experiment.experiment import report_command
 from lerobot_wm.experiment.plan import Plan
-from lerobot_wm.experiment.preset import load_preset, select_runs
+from lerobot_wm.experiment.preset import load_preset, select_runs, write_settings
 from lerobot_wm.experiment.stage import Stage, in_order, unfinished
 from lerobot_wm.inspect.quality import QualityConfig
-from lerobot_wm.report import comparison as report_arms
+from lerobot_wm.report.arms import ARMS
 from lerobot_wm.report.command import ReportConfig
 from lerobot_wm.system import parts_folder, shards_folder
 
@@ -80,6 +78,7 @@ def shape(stage: Stage) -> tuple[str, ...]:
 
 def test_every_command_line_is_understood(tmp_path: Path) -> None:
     at = plan(tmp_path, "smoke", variation_set=43)
+    write_settings(at.preset, tmp_path)
     runs = select_runs(at.preset, list(ARMS), [0])
     stages = in_order([*(stage for run in runs for stage in at.evaluations(*run)), at.quality(0)])
     # One command line of each shape: LeRobot takes half a second to read one.
@@ -105,35 +104,11 @@ def test_every_command_line_is_understood(tmp_path: Path) -> None:
     assert (report.world_model_path, report.dataset) == (None, None), "the demonstrations are gone"
 
 
-@pytest.mark.parametrize(
-    ("name", "of_bc", "on_latents"),
-    [("cpu", {"lr_decay_share": 0.5}, {}), ("paper", {}, {"updates_per_step": 20, "compile_model": True})],
-)
-def test_presets_differ_from_smoke_in_sizes_and_a_rate_of_all_bc(
-    name: str, of_bc: dict[str, float], on_latents: dict[str, int], tmp_path: Path
-) -> None:
-    preset, smoke = load_preset(name), load_preset("smoke")
+@pytest.mark.parametrize("name", ["cpu", "paper", "smoke"])
+def test_a_preset_estimates_all_its_stages(name: str, tmp_path: Path) -> None:
     stages = stages_of(tmp_path, *ARMS, preset=name)
-    assert {stage.kind for stage in stages.values()} <= set(preset.minutes)
-    assert not any(stage.resumes or stage.finished for stage in stages.values())
-    for arm in ARMS.values():
-        if arm.config is not None:
-            ours, theirs = (json.loads(each.settings(arm.config).read_text()) for each in (preset, smoke))
-            assert ours.keys() == theirs.keys()
-            # One rate for all arms of BC: a comparison with those from scratch or blind is one of inputs alone.
-            alike = of_bc if ours["policy"]["type"].endswith("_bc") else {}
-            # How a GPU is kept busy, which changes no update.
-            how = on_latents if ours["policy"]["type"] in ("wm_bc", "wm_iql") else {}
-            assert ours["policy"] == theirs["policy"] | alike | how
-
-
-def test_the_papers_batches_and_updates() -> None:
-    for arm in ARMS.values():
-        if arm.config is not None:
-            settings = json.loads(load_preset("paper").settings(arm.config).read_text())
-            updates = settings["policy"].get("updates_per_step", 1)
-            assert settings["batch_size"] / updates == 256
-            assert settings["steps"] * updates == (300_000 if "iql" in arm.config else 150_000)
+    assert {stage.kind for stage in stages.values()} <= set(load_preset(name).minutes)
+    assert not any(stage.is_resumable or stage.is_finished for stage in stages.values())
 
 
 def test_data_of_each_arm(tmp_path: Path) -> None:
@@ -166,7 +141,7 @@ def test_sweep_arms_roll_out_one_training(tmp_path: Path) -> None:
     assert not [flag for flag in stages["seed_0/eval_wm_iql"].argv if flag.startswith("--policy.beta")]
 
 
-def test_an_arm_alone_is_spared_the_actors_of_the_sweep(tmp_path: Path) -> None:
+def test_without_the_sweep_its_actors_are_not_trained(tmp_path: Path) -> None:
     alone = stages_of(tmp_path, "wm_iql", "wm_bc")["seed_0/wm_iql"]
     assert not [flag for flag in alone.argv if "sweep" in flag]
     wanted: dict[str, list[int]] = {"wm_iql": [0, 1], "wm_iql_beta3": [0]}
@@ -187,18 +162,18 @@ def test_a_finished_policy_needs_no_world_model(tmp_path: Path) -> None:
 
 def test_a_training_is_finished_by_its_last_step_only(tmp_path: Path) -> None:
     training = stages_of(tmp_path, "wm_bc")["seed_0/wm_bc"]
-    steps = json.loads(Path("configs/cpu/wm_bc.json").read_text())["steps"]
-    assert str(steps) in str(training.artefact)
-    assert not training.resumes
+    assert "030000" in training.artefact.parts
+    assert not training.is_resumable
     assert training.checkpoint is not None
     training.checkpoint.parent.mkdir(parents=True)
     training.checkpoint.write_text("{}")
-    assert training.resumes
-    assert not training.finished
+    assert training.is_resumable
+    assert not training.is_finished
     assert "--resume=true" in training.command(cores=1)
 
 
-def test_a_training_killed_between_two_links_keeps_its_checkpoints(tmp_path: Path) -> None:
+def test_a_training_killed_between_two_links_resumes_and_asking_writes_nothing(tmp_path: Path) -> None:
+    """LeRobot removes the link `last` and sets it again: a running training may be between the two."""
     training = stages_of(tmp_path, "wm_bc")["seed_0/wm_bc"]
     assert training.checkpoint is not None
     last = training.checkpoint.parents[1]
@@ -209,14 +184,14 @@ def test_a_training_killed_between_two_links_keeps_its_checkpoints(tmp_path: Pat
     ):
         (saved / file).parent.mkdir(parents=True)
         (saved / file).write_text(json.dumps(content))
-    assert not last.exists()
-    assert training.resumes
+    assert training.is_resumable
     assert "--resume=true" in training.command(cores=1)
     training.prepare()
     assert saved.is_dir()
+    assert not last.is_symlink()
 
 
-def test_collections_and_encodings_go_on_from_what_they_left(tmp_path: Path) -> None:
+def test_collections_and_encodings_resume_with_the_same_command(tmp_path: Path) -> None:
     stages = stages_of(tmp_path, "wm_bc")
     collection, encoding = stages["dataset"], stages["seed_0/latents_wm_rssm"]
     assert collection.checkpoint == shards_folder(parse(collection.argv).output_root)
@@ -224,7 +199,7 @@ def test_collections_and_encodings_go_on_from_what_they_left(tmp_path: Path) -> 
     for stage in (collection, encoding):
         begun = stage.command(cores=2)
         stage.checkpoint.mkdir(parents=True)
-        assert stage.resumes
+        assert stage.is_resumable
         assert stage.command(cores=2) == begun
 
 
@@ -263,30 +238,5 @@ def test_runs_are_chosen_by_arms_and_seeds() -> None:
     assert chosen(["wm_bc"], []) == [("wm_bc", 0), ("wm_bc", 1), ("wm_bc", 2)]
     assert chosen(["expert", "wm_iql"], [4]) == [("wm_iql", 4), ("expert", 0)]
     assert {name for name, _ in chosen([], [])} == set(preset.arms) == set(ARMS)
-    with pytest.raises(ValueError, match="No arm 'wm_cb'; there are e2e_iql"):
+    with pytest.raises(ValueError, match=r"'wm_cb'.*e2e_iql"):
         select_runs(preset, ["wm_cb"], [])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [({"noise": None}, "noise"), ({"nose": 1}, "nose"), ({"arms": {"mine": [0]}}, "No arm 'mine'")],
-)
-def test_a_broken_preset_is_refused(tmp_path: Path, change: dict, message: str) -> None:
-    shutil.copytree("configs/smoke", tmp_path / "mine")
-    file = tmp_path / "mine" / "experiment.json"
-    data = {**json.loads(file.read_text()), **change}
-    file.write_text(json.dumps({key: value for key, value in data.items() if value is not None}))
-    with pytest.raises(ValueError, match=message):
-        load_preset("mine", configs=tmp_path)
-
-
-def test_missing_settings_name_their_file(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"there are .*cpu.*paper.*smoke"):
-        load_preset("quick")
-    arm = Arm("mine", config="no_such")
-    with pytest.raises(FileNotFoundError, match=r"configs/cpu/no_such\.json"):
-        plan(tmp_path).evaluations(arm, 0)
-
-
-def test_report_describes_every_arm() -> None:
-    assert set(report_arms.ARMS) == set(ARMS)

@@ -1,4 +1,4 @@
-"""Stages of the experiment as real subprocesses: order, failure, stopping and going on."""
+"""Stages of the experiment as real subprocesses: order, failure, stopping and resuming."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from lerobot_wm.experiment.reproduce import exclusive
+from lerobot_wm.experiment.reproduce import hold_lock
 from lerobot_wm.experiment.runner import Progress, Runner, Times, minutes_left, ranks
 from lerobot_wm.experiment.stage import Stage, in_order, unfinished
 
@@ -62,7 +62,7 @@ def run(
             shown.started.append(stage.name)
             super().started(stage)
 
-    with Noting(console, times, processes, len(stages)) as progress, exclusive(folder) as lock:
+    with Noting(console, times, processes, len(stages)) as progress, hold_lock(folder) as lock:
         runner = Runner(
             stages,
             processes,
@@ -99,7 +99,7 @@ def test_stages_run_after_those_they_need_and_never_again(tmp_path: Path) -> Non
     assert shown.started == failed == []
 
 
-def test_what_a_finished_stage_needed_may_be_removed(tmp_path: Path) -> None:
+def test_what_a_finished_stage_needed_may_be_gone(tmp_path: Path) -> None:
     a = stage(tmp_path, "a")
     b = stage(tmp_path, "b", a)
     b.folder.mkdir()
@@ -109,9 +109,9 @@ def test_what_a_finished_stage_needed_may_be_removed(tmp_path: Path) -> None:
     assert list(in_order([c])) == ["a", "b", "c"]
 
 
-def test_a_failure_takes_only_what_needs_it(tmp_path: Path) -> None:
+def test_a_failure_stops_only_what_needs_it(tmp_path: Path) -> None:
     bad = stage(tmp_path, "bad", code="import sys; print('the reason'); sys.exit(3)")
-    silent = stage(tmp_path, "silent", code=WRITE)  # ends well without its artefact
+    silent = stage(tmp_path, "silent", code=WRITE)  # succeeds without its artefact
     lost = stage(tmp_path, "lost", stage(tmp_path, "between", bad))
     good = stage(tmp_path, "good", stage(tmp_path, "first"))
     shown, failed = run(tmp_path, [lost, silent, good], processes=1)
@@ -121,20 +121,20 @@ def test_a_failure_takes_only_what_needs_it(tmp_path: Path) -> None:
     assert not {"between", "lost"} & set(shown.started)
 
 
-def test_left_overs_of_a_stage_without_checkpoint_are_removed(tmp_path: Path) -> None:
-    a = stage(tmp_path, "a")  # its mkdir refuses a folder that is there
+def test_an_unfinished_folder_without_a_checkpoint_is_removed(tmp_path: Path) -> None:
+    a = stage(tmp_path, "a")  # its mkdir fails if the folder exists
     a.folder.mkdir()
     (a.folder / "half").write_text("")
     assert run(tmp_path, [a])[1] == []
     assert not (a.folder / "half").exists()
 
 
-def test_a_stopped_stage_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+def test_a_stopped_stage_resumes_from_its_checkpoint(tmp_path: Path) -> None:
     place = tmp_path / "a"
     a = stage(
         tmp_path,
         "a",
-        code="import sys; sys.exit('expected to go on')",
+        code="import sys; sys.exit('started from the beginning')",
         checkpoint=place / "checkpoint",
         resume_argv=(sys.executable, "-c", f"open({str(place / 'done')!r}, 'w').close()"),
     )
@@ -144,8 +144,8 @@ def test_a_stopped_stage_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     assert (place / "checkpoint").read_text() == "step 5"
 
 
-def test_the_time_of_a_part_is_not_noted(tmp_path: Path) -> None:
-    # A collection goes on from its shards with the command it was begun with.
+def test_the_time_of_a_resumed_stage_is_not_recorded(tmp_path: Path) -> None:
+    # A collection resumes from its shards with the same command.
     whole, rest = (
         stage(tmp_path, name, checkpoint=tmp_path / f"{name}.shards") for name in ("whole", "rest")
     )
@@ -154,7 +154,7 @@ def test_the_time_of_a_part_is_not_noted(tmp_path: Path) -> None:
     assert set(json.loads((tmp_path / "times.json").read_text())) == {"whole"}
 
 
-def test_first_what_most_waits_for(tmp_path: Path) -> None:
+def test_the_longest_chain_starts_first(tmp_path: Path) -> None:
     short = [stage(tmp_path, f"short{i}") for i in range(2)]
     long = stage(tmp_path, "long", stage(tmp_path, "start_of_long"), kind="slow")
     shown, _ = run(tmp_path, [*short, long], processes=1, minutes={"kind": 1.0, "slow": 10.0})
@@ -180,7 +180,7 @@ def test_longest_chain_and_bound_of_the_time_left(tmp_path: Path) -> None:
 
 
 def test_an_unknown_kind_is_refused_before_work_starts(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no minutes for 'strange'"):
+    with pytest.raises(ValueError, match="'strange'"):
         run(tmp_path, [stage(tmp_path, "a", kind="strange")])
     assert not (tmp_path / "a").exists()
 
@@ -188,8 +188,8 @@ def test_an_unknown_kind_is_refused_before_work_starts(tmp_path: Path) -> None:
 def test_measured_minutes_replace_the_stated_ones(tmp_path: Path) -> None:
     times = Times(tmp_path / "times.json", {"kind": 7.0})
     assert times.minutes("kind") == 7.0
-    times.note(stage(tmp_path, "a"), 60.0)
-    times.note(stage(tmp_path, "b"), 180.0)
+    times.record(stage(tmp_path, "a"), 60.0)
+    times.record(stage(tmp_path, "b"), 180.0)
     assert Times(tmp_path / "times.json", {"kind": 7.0}).minutes("kind") == 2.0
 
 
@@ -199,7 +199,7 @@ import signal, sys
 from pathlib import Path
 from rich.console import Console
 from lerobot_wm.experiment.runner import Progress
-from lerobot_wm.experiment.reproduce import exclusive
+from lerobot_wm.experiment.reproduce import hold_lock
 from lerobot_wm.experiment.runner import Runner
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.experiment.runner import Times
@@ -212,7 +212,7 @@ for name in "ab":
     argv = (sys.executable, "-c", SLEEP, str(folder / f"{name}.pid"))
     stages[name] = Stage(name, "kind", argv, folder / name, folder / name / "done")
 times = Times(folder / "times.json", {"kind": 1.0})
-with exclusive(folder) as lock, Progress(Console(), times, 2, 2) as progress:
+with hold_lock(folder) as lock, Progress(Console(), times, 2, 2) as progress:
     Runner(stages, 2, 2, times, progress, on_finish=print).run(lock)
 """
 
@@ -244,7 +244,7 @@ def test_stopping_a_run_ends_its_stages(tmp_path: Path, number: signal.Signals) 
     process.send_signal(number)
     process.wait(30)
     assert not any(map(alive, pids))
-    with exclusive(tmp_path):
+    with hold_lock(tmp_path):
         pass
 
 
@@ -252,7 +252,7 @@ def test_stopping_a_run_ends_its_stages(tmp_path: Path, number: signal.Signals) 
 def test_a_stage_that_starts_while_the_run_is_stopped_ends_with_it(
     number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The signal comes when its process is there and nobody knows of it yet."""
+    """The signal arrives between the start of its process and the registration of it."""
     started = []
 
     class Interrupted(subprocess.Popen):
@@ -278,10 +278,10 @@ def test_stages_that_outlive_a_killed_run_keep_the_folder_locked(tmp_path: Path)
     process, pids = start_long_run(tmp_path)
     process.kill()
     process.wait()
-    with pytest.raises(BlockingIOError, match="wait until"), exclusive(tmp_path):
+    with pytest.raises(BlockingIOError, match=str(tmp_path)), hold_lock(tmp_path):
         pass
     for pid in pids:
         os.kill(pid, signal.SIGKILL)
     wait_until(lambda: not any(map(alive, pids)))
-    with exclusive(tmp_path):
+    with hold_lock(tmp_path):
         pass

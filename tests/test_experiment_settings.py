@@ -1,67 +1,122 @@
-"""An output folder holds what was made with one preset's settings."""
+"""Presets resolve to complete settings, and an output folder holds results of one preset's settings only."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from lerobot_wm.experiment.arms import ARMS
-from lerobot_wm.experiment.preset import Preset, check_settings, load_preset
+from lerobot_wm.experiment.preset import Preset, config_file, load_preset, write_settings
+from lerobot_wm.report.arms import ARMS, TRAININGS
+
+PRESETS = sorted(file.stem for file in Path("configs").glob("*.json"))
 
 
-@pytest.fixture
-def preset(tmp_path: Path) -> Preset:
-    shutil.copytree(Path("configs") / "smoke", tmp_path / "configs" / "smoke")
-    return load_preset("smoke", tmp_path / "configs")
+def changed(preset: Preset, training: str, **settings: Any) -> Preset:
+    return replace(preset, trainings=preset.trainings | {training: preset.trainings[training] | settings})
 
 
-def change(preset: Preset, file: str, **settings: object) -> None:
-    path = preset.folder / file
-    path.write_text(json.dumps(json.loads(path.read_text()) | settings))
+@pytest.mark.parametrize("name", PRESETS)
+def test_all_bc_policies_of_a_preset_share_their_settings(name: str) -> None:
+    """A comparison with policies from scratch or without images is then one of inputs alone."""
+    trainings = load_preset(name).trainings
+    shared = [
+        {key: trainings[training]["policy"].get(key) for key in ("lr_decay_share", "action_noise", "dtype")}
+        for training in TRAININGS
+        if "_bc" in training
+    ]
+    assert all(settings == shared[0] for settings in shared)
 
 
-def test_changed_settings_are_refused_until_they_are_set_back(preset: Preset, tmp_path: Path) -> None:
-    output_dir = tmp_path / "outputs"
-    check_settings(preset, output_dir)
-    for file, name, value in (("wm_bc.json", "steps", 7), ("experiment.json", "noise", 0.7)):
-        original = (preset.folder / file).read_text()
-        change(preset, file, **{name: value})
-        with pytest.raises(ValueError, match=rf"{name} of .*{file}.* another --output_dir"):
-            check_settings(preset, output_dir)
-        (preset.folder / file).write_text(original)
-        check_settings(preset, output_dir)
-    change(preset, "wm_bc.json", steps=7)
-    check_settings(preset, tmp_path / "others")
+def test_later_patterns_take_precedence_over_earlier_ones() -> None:
+    preset = load_preset("cpu")
+    three_seeds = ("wm_iql", "wm_bc", "e2e_iql", "e2e_bc")
+    assert preset.arms == {arm: [0, 1, 2] if arm in three_seeds else [0] for arm in ARMS}
+    assert preset.trainings["e2e_bc_single"] == {
+        "policy": {"type": "e2e_bc", "lr_decay_share": 0.5, "push_to_hub": False},
+        "batch_size": 128,
+        "steps": 3000,
+        "save_freq": 1000,
+        "log_freq": 100,
+    }
 
 
-def test_further_arms_seeds_and_settings_files_change_nothing(preset: Preset, tmp_path: Path) -> None:
-    check_settings(preset, tmp_path)
-    change(preset, "experiment.json", arms={"wm_bc": [0, 1]}, videos_per_task=0)
-    (preset.folder / "new_arm.json").write_text("{}")
-    check_settings(replace(preset, arms={"wm_bc": [0, 1]}), tmp_path)
-    change(preset, "new_arm.json", steps=1)
-    with pytest.raises(ValueError, match=r"steps of .*new_arm"):
-        check_settings(preset, tmp_path)
+def test_the_papers_batches_and_updates() -> None:
+    for name, settings in load_preset("paper").trainings.items():
+        assert settings["batch_size"] == 256
+        assert settings["steps"] == (3_000 if "rssm" in name else 300_000 if "iql" in name else 150_000)
 
 
-def test_an_arm_that_is_defined_otherwise_is_refused(
-    preset: Preset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    check_settings(preset, tmp_path)
-    changed = replace(ARMS["wm_bc"], train_flags=("--policy.dropout=0",))
-    monkeypatch.setitem(ARMS, "wm_bc", changed)
-    with pytest.raises(ValueError, match=r"wm_bc of .*arms\.py.* another --output_dir"):
-        check_settings(preset, tmp_path)
+@pytest.mark.parametrize(
+    ("changes", "fact"),
+    [
+        ({"noise": None}, "noise"),
+        ({"nose": 1}, "nose"),
+        ({"arms": {"mine": [0]}}, "'mine'"),
+        ({"trainings": {"*": {"steps": 1}, "e2c_*": {}}}, r"'e2c_\*'"),
+        ({"trainings": {"wm_rssm": {"steps": 1}}}, "steps"),
+    ],
+)
+def test_a_broken_preset_is_refused(tmp_path: Path, changes: dict, fact: str) -> None:
+    data = {**json.loads(Path("configs/smoke.json").read_text()), **changes}
+    file = tmp_path / "mine.json"
+    file.write_text(json.dumps({key: value for key, value in data.items() if value is not None}))
+    with pytest.raises(ValueError, match=rf"mine\.json.*{fact}"):
+        load_preset("mine", configs=tmp_path)
+
+
+def test_an_unknown_preset_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(FileNotFoundError, match=r"'quick'.*cpu.*paper.*smoke"):
+        load_preset("quick")
+
+
+def test_the_folder_gets_the_resolved_settings(tmp_path: Path) -> None:
+    preset = load_preset("smoke")
+    write_settings(preset, tmp_path)
+    files = {name: json.loads(config_file(tmp_path, name).read_text()) for name in TRAININGS}
+    assert files == preset.trainings
+
+
+def test_changed_settings_are_refused_until_they_are_set_back(tmp_path: Path) -> None:
+    preset = load_preset("smoke")
+    write_settings(preset, tmp_path)
+    before = config_file(tmp_path, "wm_bc").read_text()
+    for fact, different in (
+        ("wm_bc", changed(preset, "wm_bc", steps=7)),
+        ("noise", replace(preset, noise=0.7)),
+        ("name", load_preset("quickstart")),
+    ):
+        with pytest.raises(ValueError, match=rf"{tmp_path} .*{fact}.*--output_dir"):
+            write_settings(different, tmp_path)
+        assert config_file(tmp_path, "wm_bc").read_text() == before
+        write_settings(preset, tmp_path)
+    write_settings(changed(preset, "wm_bc", steps=7), tmp_path / "others")
+
+
+def test_other_arms_videos_and_estimates_change_nothing(tmp_path: Path) -> None:
+    preset = load_preset("smoke")
+    write_settings(preset, tmp_path)
+    write_settings(replace(preset, arms={"wm_bc": [0, 1]}, videos_per_task=0, minutes={}), tmp_path)
+
+
+def test_a_new_training_is_added_and_its_changes_are_refused_afterwards(tmp_path: Path) -> None:
+    preset = load_preset("smoke")
+    write_settings(preset, tmp_path)
+    more = replace(preset, trainings=preset.trainings | {"mine": {"steps": 1}})
+    write_settings(more, tmp_path)
+    with pytest.raises(ValueError, match="mine"):
+        write_settings(changed(more, "mine", steps=2), tmp_path)
+
+
+def test_a_changed_arm_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    preset = load_preset("smoke")
+    write_settings(preset, tmp_path)
+    different = replace(ARMS["wm_bc"], train_flags=("--policy.dropout=0",))
+    monkeypatch.setitem(ARMS, "wm_bc", different)
+    with pytest.raises(ValueError, match="wm_bc"):
+        write_settings(preset, tmp_path)
     monkeypatch.undo()
-    monkeypatch.setitem(ARMS, "further", changed)
-    check_settings(preset, tmp_path)
-
-
-def test_a_folder_of_before_arms_were_noted_is_gone_on_with(preset: Preset, tmp_path: Path) -> None:
-    check_settings(preset, tmp_path)
-    path = tmp_path / "settings.json"
-    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "arms"}))
-    check_settings(preset, tmp_path)
-    assert "wm_bc" in json.loads(path.read_text())["arms"]
+    monkeypatch.setitem(ARMS, "mine", different)
+    monkeypatch.setitem(ARMS, "wm_iql", replace(ARMS["wm_iql"], description="reworded"))
+    write_settings(preset, tmp_path)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_wm.constants import MT6
-from lerobot_wm.experiment.arms import ARMS
 from lerobot_wm.records import read_records, record_line
+from lerobot_wm.report.arms import ARMS
 
 SCRIPT = Path("scripts") / "reproduce_table1.py"
 ROLLOUTS = 2 * len(MT6)  # of each arm in the preset `smoke`
@@ -43,11 +43,11 @@ def test_every_arm_is_rolled_out_once(finished: Path) -> None:
     assert "Stages to run: 0" in reproduce(finished, "--quality", "--list")
 
 
-def test_a_training_that_was_killed_goes_on_from_its_checkpoint(finished: Path) -> None:
-    finished = finished.rename(finished.with_name("moved"))  # the folder may have been moved, too
-    records = finished / "own_records.jsonl"  # what the folder rolled out; records.jsonl is made of it
+def test_a_killed_training_resumes_from_its_checkpoint(finished: Path) -> None:
+    finished = finished.rename(finished.with_name("moved"))  # the folder may have been moved too
+    records = finished / "own_records.jsonl"  # records.jsonl is made from it
     before = read_records([records])
-    # As a kill after the first checkpoint leaves it.
+    # The state after a kill that followed the first checkpoint.
     run = finished / "seed_0" / "wm_bc"
     shutil.rmtree(run / "checkpoints" / "000020")
     (run / "checkpoints" / "last").unlink()
@@ -56,7 +56,7 @@ def test_a_training_that_was_killed_goes_on_from_its_checkpoint(finished: Path) 
     records.write_text("".join(record_line(record) for record in before if record["arm"] != "wm_bc"))
 
     shown = reproduce(finished, "--arms=wm_bc", "--list")
-    assert "goes on from its checkpoint" in shown
+    assert "to resume" in shown
     assert "Stages to run: 2" in shown
     reproduce(finished, "--arms=wm_bc")
     assert "--resume=true" in (finished / "seed_0" / "wm_bc.log").read_text()

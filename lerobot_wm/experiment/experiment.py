@@ -1,4 +1,4 @@
-"""Some arms and seeds of a preset: what is done, what is left, and doing it."""
+"""Some arms and seeds of a preset: what is finished, what is left, and running it."""
 
 import shutil
 import subprocess
@@ -9,25 +9,26 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from lerobot_wm.constants import RECORDS_NAME, REPORTED_VARIATION_SET
-from lerobot_wm.experiment.arms import Arm
 from lerobot_wm.experiment.ledger import Ledger
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.runner import Progress, Runner, Times, environment, minutes_left, minutes_text
 from lerobot_wm.experiment.stage import Stage, in_order, lerobot_wm, unfinished
+from lerobot_wm.report.arms import Arm
 from lerobot_wm.system import usable_cores
 
 
 def report_command(plan: Plan, runs: list[tuple[Arm, int]], records: Path, folder: Path) -> tuple[str, ...]:
-    """`lerobot-wm report` over all records, with the videos and curves of each arm's first seed.
+    """Compose `lerobot-wm report` over all records, with the videos and curves of each arm's first seed.
 
     Args:
         plan: The experiment.
         runs: Its arms and seeds.
         records: The records file.
-        folder: Where the report goes.
+        folder: Where the report is written.
     """
     first = {arm.name: (arm, seed) for arm, seed in reversed(runs)}.values()
-    trained = [(arm, seed) for arm, seed in first if arm.config is not None]  # the expert leaves no videos
+    # The expert has no videos.
+    trained = [(arm, seed) for arm, seed in first if arm.training is not None]
     evaluations = [stage for run in trained for stage in plan.evaluations(*run)]
     trainings = [stage for arm, seed in trained if not arm.individual for stage in plan.policies(arm, seed)]
     seed = runs[0][1]
@@ -38,26 +39,26 @@ def report_command(plan: Plan, runs: list[tuple[Arm, int]], records: Path, folde
         "title": f"World-model policies and controls, preset {plan.preset.name}",
     }
     for flag, stages in (("videos", evaluations), ("train_logs", [world_model.made_by, *trainings])):
-        folders = dict.fromkeys(str(stage.folder) for stage in stages if stage.finished)
+        folders = dict.fromkeys(str(stage.folder) for stage in stages if stage.is_finished)
         if folders:
             flags[flag] = ",".join(folders)
-    # Once all is trained the demonstrations may have been removed: the world model is shown on them.
-    if world_model.made_by.finished and dataset.made_by.finished:
+    # The world model is shown on the demonstrations. They may be removed once everything is trained.
+    if world_model.made_by.is_finished and dataset.made_by.is_finished:
         flags |= {"world_model_path": world_model.path, **dataset.flags()}
-    if quality.finished:
+    if quality.is_finished:
         flags["quality"] = quality.artefact
     return lerobot_wm("report", flags)
 
 
 class Experiment:
-    """Some arms and seeds of a preset, and how far they are.
+    """Some arms and seeds of a preset, and their progress.
 
     Args:
         plan: Builds the stages.
         runs: The arms and seeds.
-        results_dir: Holds the committed records, compressed.
-        processes: Stages side by side at most.
-        quality: Whether the world model is judged, too.
+        results_dir: Committed records, compressed.
+        processes: How many stages run side by side at most.
+        quality: Whether the world model's quality is measured too.
     """
 
     def __init__(
@@ -75,62 +76,65 @@ class Experiment:
         self._quality = [plan.quality(runs[0][1])] if quality else []
 
     def _open_runs(self) -> list[tuple[Arm, int]]:
-        """The arms and seeds whose records are not complete."""
+        """The arms and seeds whose records are incomplete."""
         return [(arm, seed) for arm, seed in self.runs if (arm.name, seed) not in self.ledger]
 
-    def targets(self) -> list[Stage]:
-        """The last stages of what is not recorded yet."""
+    def _targets(self) -> list[Stage]:
+        """The last stages of all that is not recorded yet."""
         return [
             *(stage for run in self._open_runs() for stage in self.plan.evaluations(*run)),
             *self._quality,
         ]
 
-    def settle(self) -> None:
-        """Take the rollouts of arms and seeds that have become complete into the records."""
+    def _record_finished(self) -> None:
+        """Add the rollouts of newly finished arms and seeds to the records."""
         for arm, seed in self._open_runs():
             stages = self.plan.evaluations(arm, seed)
-            if all(stage.finished for stage in stages):
+            if all(stage.is_finished for stage in stages):
                 self.ledger.add(arm.name, seed, [stage.folder / RECORDS_NAME for stage in stages])
 
     def show(self, console: Console) -> None:
-        """Print every stage and its state."""
-        todo = unfinished(self.targets())
+        """Print every stage and its state; writes nothing."""
+        todo = unfinished(self._targets())
         table = Table(Column("stage", overflow="fold"), "state", "minutes", box=None)
         for arm, seed in self.runs:
             if (arm.name, seed) in self.ledger:
                 table.add_row(f"{arm.name}, seed {seed}", "records complete", "")
-        for name, stage in in_order(self.targets()).items():
+        for name, stage in in_order(self._targets()).items():
             if name in todo:
-                state = "goes on from its checkpoint" if stage.resumes else "to run"
+                state = "to resume" if stage.is_resumable else "to run"
                 table.add_row(name, state, f"{self.times.minutes(stage.kind):.1f}")
             else:
-                table.add_row(name, "finished" if stage.finished else "not needed", "")
+                table.add_row(name, "finished" if stage.is_finished else "not needed", "")
         console.print(table)
         minutes = {name: self.times.minutes(stage.kind) for name, stage in todo.items()}
         left = minutes_text(minutes_left(todo, minutes, self.processes))
         console.print(f"Stages to run: {len(todo)}, about {left} with {self.processes} side by side")
 
-    def tell_committed(self, console: Console) -> None:
-        """Say which arms and seeds are not run: with changed settings their records would be taken for new ones."""
+    def name_committed(self, console: Console) -> None:
+        """Print which arms and seeds do not run because their records are committed.
+
+        Otherwise a user who has changed settings would take these records for new ones.
+        """
         taken = [
             f"{arm.name} {seed}" for arm, seed in self.runs if self.ledger.is_committed((arm.name, seed))
         ]
         if taken:
             console.print(
-                f"Not run, but taken from {self._committed}: {', '.join(taken)} (arm and seed). "
-                "--results_dir=outputs/none runs them, too.",
+                f"Records taken from {self._committed}, not run: {', '.join(taken)} (arm and seed). "
+                "Run them too with --results_dir=outputs/none.",
                 highlight=False,
             )
 
     def run(self, lock: IO, console: Console) -> list[Stage]:
-        """Run what is left; returns the stages that failed.
+        """Run the unfinished stages and return those that failed.
 
         Args:
             lock: A file that every stage holds open.
             console: Where progress is shown.
         """
-        self.settle()
-        todo = unfinished(self.targets())
+        self._record_finished()
+        todo = unfinished(self._targets())
         with Progress(console, self.times, self.processes, len(todo)) as progress:
             return Runner(
                 todo,
@@ -138,14 +142,15 @@ class Experiment:
                 usable_cores(),
                 self.times,
                 progress,
-                on_finish=lambda stage: self.settle(),
+                on_finish=lambda stage: self._record_finished(),
             ).run(lock)
 
     def report(self) -> bool:
-        """Write the records and the report, where anything is finished; returns whether that went well."""
+        """Write the records and the report if anything is finished, and return whether that succeeded."""
         if self.ledger.empty:
             return True
         self.ledger.write()
-        shutil.rmtree(self.report_dir, ignore_errors=True)  # cheap, so it always shows the records there are
+        # It is cheap to write, so it always shows the latest records.
+        shutil.rmtree(self.report_dir, ignore_errors=True)
         command = report_command(self.plan, self.runs, self.ledger.path, self.report_dir)
         return subprocess.run(command, env=environment(usable_cores())).returncode == 0

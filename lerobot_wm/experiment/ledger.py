@@ -1,4 +1,4 @@
-"""The records of an experiment: every finished arm and seed once, in files that are never half-written."""
+"""The records of an experiment: every finished arm and seed once, in files that are never incomplete."""
 
 from pathlib import Path
 
@@ -10,18 +10,18 @@ type Runs = dict[tuple[str, int | None], list[Record]]  # by (arm, seed)
 
 
 class Ledger:
-    """The records of an experiment by (arm, seed): committed ones, and those that its output folder rolled out.
+    """The records of an experiment by (arm, seed): committed ones, and those of its own rollouts.
 
-    An arm and seed is in it when each of its rollouts is, one on every variation of every task. Committed records win.
-    The two are kept apart, so that committed records do not count where others are asked for later.
+    It contains an arm and seed once all its rollouts are recorded, one on every variation of every task. Committed
+    records take precedence. Own ones are stored separately, so that another run can do without the committed ones.
 
     Args:
-        path: Where all of them are written together; the folder's own are beside it, in a file named own_....
-        committed: Records that count although nothing else of their runs is left.
+        path: File for all records; the own ones are beside it in `own_<name>`.
+        committed: Records that count without the output folders of their runs.
         preset: Says which rollouts an arm and seed has.
 
     Raises:
-        ValueError: a file holds something else than records, or those of another preset.
+        ValueError: A file holds something other than records, or records of another preset.
     """
 
     def __init__(self, path: Path, committed: Path, preset: Preset) -> None:
@@ -29,15 +29,15 @@ class Ledger:
         self._own_path = path.with_name(f"own_{path.name}")
         self._preset = preset.name
         self._rollouts = {(task, k) for task in preset.task_names for k in preset.variations}
-        self._committed = self._whole_runs(committed)
-        self._own = self._whole_runs(self._own_path)
+        self._committed = self._complete_runs(committed)
+        self._own = self._complete_runs(self._own_path)
 
     def __contains__(self, run: tuple[str, int]) -> bool:
         """Whether an arm and seed is finished."""
         return run in self._committed or run in self._own
 
     def is_committed(self, run: tuple[str, int]) -> bool:
-        """Whether an arm and seed is finished because its records were committed."""
+        """Whether the records of an arm and seed are committed."""
         return run in self._committed
 
     @property
@@ -46,47 +46,47 @@ class Ledger:
         return not self._committed and not self._own
 
     def add(self, arm: str, seed: int, files: list[Path]) -> None:
-        """Take the rollouts of a finished arm and seed; those it has already are left as they are.
+        """Add the rollouts of a finished arm and seed, unless they are recorded already.
 
         Raises:
-            ValueError: the files hold other rollouts than these, or those of another preset.
+            ValueError: The files hold other rollouts, or rollouts of another preset.
         """
         if (arm, seed) in self:
             return
         records = self._read(files)
-        if set(by_run(records)) != {(arm, seed)} or not self._whole(records):
+        if set(_by_run(records)) != {(arm, seed)} or not self._is_complete(records):
             found = sorted({(record["arm"], record["seed"]) for record in records}, key=str)
             raise ValueError(
                 f"{', '.join(map(str, files))}: {len(records)} rollouts of (arm, seed) {found}; expected the "
-                f"{len(self._rollouts)} of ('{arm}', {seed}). Remove these folders to roll out again."
+                f"{len(self._rollouts)} of ('{arm}', {seed}). Remove their folders to roll out again."
             )
         self._own[arm, seed] = records
         _write(self._own_path, self._own)
 
     def write(self) -> None:
-        """Write all records to the one file."""
+        """Write all records to one file."""
         _write(self.path, self._own | self._committed)
 
-    def _whole_runs(self, file: Path) -> Runs:
+    def _complete_runs(self, file: Path) -> Runs:
         if not file.is_file() or not file.stat().st_size:
             return {}
-        return {run: rows for run, rows in by_run(self._read([file])).items() if self._whole(rows)}
+        return {run: rows for run, rows in _by_run(self._read([file])).items() if self._is_complete(rows)}
 
     def _read(self, files: list[Path]) -> list[Record]:
         records = read_records(files)
         others = {record["preset"] for record in records} - {self._preset}
         if others:
             raise ValueError(
-                f"{', '.join(map(str, files))}: rollouts of the preset {', '.join(sorted(map(str, others)))}, which do "
-                f"not count for '{self._preset}'. Give another --output_dir or --results_dir."
+                f"{', '.join(map(str, files))}: rollouts of the preset {', '.join(sorted(map(str, others)))}; "
+                f"expected '{self._preset}'. Use another --output_dir or --results_dir."
             )
         return records
 
-    def _whole(self, records: list[Record]) -> bool:
+    def _is_complete(self, records: list[Record]) -> bool:
         return {(record["task"], record["variation"]) for record in records} == self._rollouts
 
 
-def by_run(records: list[Record]) -> Runs:
+def _by_run(records: list[Record]) -> Runs:
     """Records by (arm, seed), in order."""
     runs: Runs = {}
     for record in records:

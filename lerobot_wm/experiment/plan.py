@@ -1,6 +1,5 @@
-"""The experiment as stages: which command makes what, from which other stage's result."""
+"""The experiment as stages: which command makes what, and from which other stage's result."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,9 +25,9 @@ from lerobot_wm.constants import (
 )
 from lerobot_wm.data.latents import RECORD_PATH
 from lerobot_wm.data.schema import COLLECTION_RECORD, RELABEL_RECORD
-from lerobot_wm.experiment.arms import WM_RSSM, Arm, Encoder
-from lerobot_wm.experiment.preset import Preset
+from lerobot_wm.experiment.preset import Preset, config_file
 from lerobot_wm.experiment.stage import Checkpoint, Dataset, Stage, lerobot_wm
+from lerobot_wm.report.arms import WM_RSSM, Arm, Encoder
 from lerobot_wm.system import parts_folder, shards_folder
 from lerobot_wm.train.resume import can_resume
 
@@ -41,12 +40,12 @@ class Demonstrations:
     output_dir: Path
 
     def sparse(self) -> Dataset:
-        """On the seen variations, with the 0/1 reward."""
+        """Those of the seen variations, with the 0/1 reward."""
         count = self.preset.episodes_per_task
         return self._collect("dataset", count, NUM_SEEN_VARIATIONS, REPORTED_VARIATION_SET)
 
     def dense(self) -> Dataset:
-        """The same with Meta-World's shaped reward."""
+        """The same ones with Meta-World's shaped reward."""
         source, folder = self.sparse(), self.output_dir / "dataset_dense"
         repo_id = f"local/{self.preset.name}_{folder.name}"
         flags = {
@@ -66,7 +65,7 @@ class Demonstrations:
         return Dataset(stage, repo_id)
 
     def held_out(self) -> Dataset:
-        """On positions that nothing is trained on, at most one episode on each."""
+        """Those of variations that nothing is trained on, at most one episode each."""
         count = min(NUM_VARIATIONS, self.preset.episodes_per_task)
         return self._collect("held_out", count, NUM_VARIATIONS, SELECTION_VARIATION_SET)
 
@@ -102,7 +101,7 @@ class Plan:
     Args:
         preset: Its sizes.
         output_dir: Where everything is written.
-        variation_set: The fixed positions that policies are rolled out on.
+        variation_set: The fixed variations that policies are rolled out on.
     """
 
     preset: Preset
@@ -111,19 +110,19 @@ class Plan:
 
     @property
     def demonstrations(self) -> Demonstrations:
-        """The data."""
+        """Its datasets."""
         return Demonstrations(self.preset, self.output_dir)
 
     def evaluations(self, arm: Arm, seed: int) -> list[Stage]:
-        """The last stages of an arm and seed; each leaves a records.jsonl in its folder."""
-        if arm.config is None:
+        """The last stages of an arm and seed. Each writes a records.jsonl into its folder."""
+        if arm.training is None:
             return [self._expert(arm)]
         tasks = self.preset.task_names if arm.individual else [None]
         return [self._evaluation(arm, seed, task) for task in tasks]
 
     def policies(self, arm: Arm, seed: int) -> list[Stage]:
-        """The trainings of an arm and seed."""
-        if arm.config is None:
+        """The training runs of an arm and seed."""
+        if arm.training is None:
             return []
         tasks = self.preset.task_names if arm.individual else [None]
         return [self._policy(arm, seed, task).made_by for task in tasks]
@@ -133,7 +132,7 @@ class Plan:
         return self._encoder(WM_RSSM, seed)
 
     def quality(self, seed: int) -> Stage:
-        """How good the world model of this seed is on positions it was never trained on."""
+        """The quality of this seed's world model on variations that it was not trained on."""
         world_model = self.world_model(seed)
         training, held_out = self.demonstrations.sparse(), self.demonstrations.held_out()
         name = f"seed_{seed}/quality"
@@ -150,8 +149,8 @@ class Plan:
 
     def _encoder(self, encoder: Encoder, seed: int) -> Checkpoint:
         source = self.demonstrations.sparse()
-        if encoder.config is not None:
-            return self._training(encoder.name, encoder.config, seed, source, *encoder.flags)
+        if encoder.training is not None:
+            return self._training(encoder.name, encoder.training, seed, source, *encoder.flags)
         name = f"seed_{seed}/{encoder.name}"
         folder = self.output_dir / name
         path = folder / PRETRAINED_MODEL_DIR
@@ -182,40 +181,38 @@ class Plan:
         return Dataset(stage, repo_id)
 
     def _policy(self, arm: Arm, seed: int, task: str | None) -> Checkpoint:
-        assert arm.config is not None
-        run, flags = arm.training, list(arm.train_flags)
+        assert arm.training is not None
+        run, flags = arm.run, list(arm.train_flags)
         if arm.encoder is not None:
             dataset = self._latents(arm.encoder, seed)
             flags.append(f"--policy.world_model_path={self._encoder(arm.encoder, seed).path}")
         else:
             dataset = self.demonstrations.dense() if arm.dense_reward else self.demonstrations.sparse()
         if task is not None:
-            # A collection's episodes are in the order of its tasks, equally many of each.
+            # A collection's episodes are in the order of its tasks, the same number for each.
             count, position = self.preset.episodes_per_task, self.preset.task_names.index(task)
             episodes = ",".join(map(str, range(position * count, (position + 1) * count)))
             run, flags = f"{run}_{task}", [*flags, f"--dataset.episodes=[{episodes}]"]
-        return self._training(run, arm.config, seed, dataset, *flags)
+        return self._training(run, arm.training, seed, dataset, *flags)
 
-    def _training(self, run: str, config: str, seed: int, dataset: Dataset, *more: str) -> Checkpoint:
-        name, settings = f"seed_{seed}/{run}", self.preset.settings(config)
+    def _training(self, run: str, training: str, seed: int, dataset: Dataset, *more: str) -> Checkpoint:
+        name, config = f"seed_{seed}/{run}", config_file(self.output_dir, training)
         folder = self.output_dir / name
-        steps = json.loads(settings.read_text())["steps"]
-        # Named by its step, not as "last": what is rolled out is the end of the training or nothing.
+        steps = self.preset.trainings[training]["steps"]
+        # Named by its step, not "last": only a complete training run is rolled out.
         final = get_step_checkpoint_dir(folder, steps, steps)
         last = folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
-        # Given again where a training goes on: the folders may have been moved since.
+        # A resumed run is given them again: the folders may have been moved.
         places = {"output_dir": folder, **dataset.flags()}
         stage = Stage(
             name=name,
-            kind=config,
-            argv=lerobot_wm(
-                "train", {"config_path": settings, "seed": seed, "job_name": run, **places}, *more
-            ),
+            kind=training,
+            argv=lerobot_wm("train", {"config_path": config, "seed": seed, "job_name": run, **places}, *more),
             folder=folder,
             artefact=final / TRAINING_STATE_DIR / OPTIMIZER_PARAM_GROUPS,
             needs=(dataset.made_by,),
             checkpoint=last,
-            is_there=can_resume,
+            can_resume=can_resume,
             resume_argv=lerobot_wm("train", {"config_path": last, "resume": "true", **places}),
         )
         return Checkpoint(stage, final / PRETRAINED_MODEL_DIR)

@@ -1,25 +1,28 @@
-"""Presets: the size of an experiment, as `configs/<preset>/experiment.json` beside its training settings."""
+"""Presets: the sizes of an experiment and its training settings, one file `configs/<preset>.json` each."""
 
 import json
 from dataclasses import asdict, dataclass, fields
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from lerobot_wm.constants import NUM_VARIATIONS
 from lerobot_wm.envs.tasks import resolve_tasks
-from lerobot_wm.experiment.arms import ARMS, WM_IQL_IN_SWEEP, Arm
 from lerobot_wm.files import write_whole
+from lerobot_wm.report.arms import ARMS, TRAININGS, WM_IQL_IN_SWEEP, Arm
 
 CONFIGS = Path("configs")
-PRESET_FILE = "experiment.json"
 
 
 @dataclass(frozen=True)
 class Preset:
-    """What all arms of an experiment share.
+    """What all arms of an experiment share, as its file says.
+
+    In the file, the keys of `arms` and `trainings` are names or patterns (`*_bc*`). All entries that match a name apply
+    to it; where they differ, the last one counts.
 
     Args:
-        folder: Where it was read from; its name is the preset's.
+        name: As in records: the file's name.
         tasks: A task set or a comma-separated list.
         episodes_per_task: Demonstrations of each task.
         noise: Standard deviation of the noise on the expert's actions.
@@ -28,11 +31,12 @@ class Preset:
         rollouts_per_task: Rollouts of each task, on that variation and those after it.
         episode_length: Steps after which a rollout is a failure.
         videos_per_task: Rollouts of each task that are filmed, the first ones.
-        arms: Arms run when none are named, each with its training seeds.
-        minutes: Wall time expected of each kind of stage, until one of them has been measured.
+        arms: Arms that run by default, each with its training seeds.
+        trainings: Settings of `lerobot-wm train` by name, complete but for dataset, seed and folder.
+        minutes: Expected wall time of each kind of stage, used until one has been measured.
     """
 
-    folder: Path
+    name: str
     tasks: str
     episodes_per_task: int
     noise: float
@@ -42,12 +46,8 @@ class Preset:
     episode_length: int
     videos_per_task: int
     arms: dict[str, list[int]]
+    trainings: dict[str, dict[str, Any]]
     minutes: dict[str, float]
-
-    @property
-    def name(self) -> str:
-        """As in records."""
-        return self.folder.name
 
     @property
     def task_names(self) -> tuple[str, ...]:
@@ -60,53 +60,69 @@ class Preset:
         seeds = range(self.first_eval_seed, self.first_eval_seed + self.rollouts_per_task)
         return [seed % NUM_VARIATIONS for seed in seeds]
 
-    def settings(self, config: str) -> Path:
-        """A training settings file.
-
-        Raises:
-            FileNotFoundError: the preset has none of this name.
-        """
-        path = self.folder / f"{config}.json"
-        if not path.is_file():
-            raise FileNotFoundError(f"The preset '{self.name}' has no {path}: add it, or leave out its arms.")
-        return path
-
 
 def load_preset(name: str, configs: Path = CONFIGS) -> Preset:
     """Read a preset.
 
     Raises:
-        FileNotFoundError: there is none of this name.
-        ValueError: its fields are not those of `Preset`, or it names an unknown arm.
+        FileNotFoundError: There is none of this name.
+        ValueError: A field is missing or unknown, a pattern matches nothing, or a training has no steps.
     """
-    path = configs / name / PRESET_FILE
+    path = configs / f"{name}.json"
     if not path.is_file():
-        found = sorted(file.parent.name for file in configs.glob(f"*/{PRESET_FILE}"))
-        raise FileNotFoundError(f"No preset '{name}': {path} is missing; there are {', '.join(found)}.")
+        found = ", ".join(sorted(file.stem for file in configs.glob("*.json")))
+        raise FileNotFoundError(f"No preset '{name}': {path} not found. Presets are {found}.")
     data = json.loads(path.read_text())
-    expected = {field.name for field in fields(Preset)} - {"folder"}
+    expected = {field.name for field in fields(Preset)} - {"name"}
     if set(data) != expected:
-        wrong = sorted(set(data) ^ expected)
-        raise ValueError(f"{path} lacks or has too many of {wrong}; expected {sorted(expected)}.")
-    preset = Preset(folder=path.parent, **data)
-    for arm in preset.arms:
-        known_arm(arm)
-    return preset
+        raise ValueError(
+            f"{path}: missing or unknown {sorted(set(data) ^ expected)}; expected {sorted(expected)}."
+        )
+    for table, names in (("arms", ARMS), ("trainings", TRAININGS)):
+        for pattern in data[table]:
+            if not any(fnmatchcase(name, pattern) for name in names):
+                raise ValueError(f"{path}: '{pattern}' in '{table}' matches none of {', '.join(names)}.")
+    data["arms"] = {arm: seeds[-1] for arm in ARMS if (seeds := _matching(data["arms"], arm))}
+    trainings = {}
+    for training, policy in TRAININGS.items():
+        settings: dict[str, Any] = {"policy": {**policy, "push_to_hub": False}}
+        for changes in _matching(data["trainings"], training):
+            settings = _merged(settings, changes)
+        if "steps" not in settings:
+            raise ValueError(
+                f"{path}: 'trainings' gives no steps for '{training}'; add them, for all under '*'."
+            )
+        trainings[training] = settings
+    return Preset(name=name, **data | {"trainings": trainings})
+
+
+def _matching[T](table: dict[str, T], name: str) -> list[T]:
+    """The entries whose key, a name or a pattern, matches a name."""
+    return [value for pattern, value in table.items() if fnmatchcase(name, pattern)]
+
+
+def _merged(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    nested = {
+        key: _merged(settings[key], value)
+        for key, value in changes.items()
+        if isinstance(value, dict) and key in settings
+    }
+    return settings | changes | nested
 
 
 def known_arm(name: str) -> Arm:
     """The arm of this name.
 
     Raises:
-        ValueError: there is none.
+        ValueError: There is none.
     """
     if name not in ARMS:
-        raise ValueError(f"No arm '{name}'; there are {', '.join(ARMS)}.")
+        raise ValueError(f"No arm '{name}'. Arms are {', '.join(ARMS)}.")
     return ARMS[name]
 
 
 def select_runs(preset: Preset, arms: list[str], seeds: list[int]) -> list[tuple[Arm, int]]:
-    """Every (arm, seed) asked for, in the order of tables; `wm_iql` is that of the sweep where there is one.
+    """Every (arm, seed) that is asked for, in the order of tables. `wm_iql` shares the sweep's critics if there is one.
 
     Args:
         preset: Gives the arms and the seeds that are not named.
@@ -115,16 +131,16 @@ def select_runs(preset: Preset, arms: list[str], seeds: list[int]) -> list[tuple
             expert is not trained and runs once.
 
     Raises:
-        ValueError: an arm is unknown.
+        ValueError: An arm is unknown.
     """
     wanted = {known_arm(name).name for name in arms or preset.arms}
     runs = [
         (arm, seed)
         for name, arm in ARMS.items()
         if name in wanted
-        for seed in ([0] if arm.config is None else seeds or preset.arms.get(name, [0]))
+        for seed in ([0] if arm.training is None else seeds or preset.arms.get(name, [0]))
     ]
-    with_sweep = {seed for arm, seed in runs if arm.training == WM_IQL_IN_SWEEP.training}
+    with_sweep = {seed for arm, seed in runs if arm.run == WM_IQL_IN_SWEEP.run}
     return [
         (WM_IQL_IN_SWEEP if arm.name == WM_IQL_IN_SWEEP.name and seed in with_sweep else arm, seed)
         for arm, seed in runs
@@ -133,48 +149,45 @@ def select_runs(preset: Preset, arms: list[str], seeds: list[int]) -> list[tuple
 
 SETTINGS_NAME = "settings.json"
 
-_ARMS = "arms"  # in that file, beside the names of the preset's
 
-_CHANGE_NOTHING_MADE = ("arms", "minutes", "videos_per_task")  # of experiment.json
+def config_file(output_dir: Path, training: str) -> Path:
+    """Where `write_settings` puts the `--config_path` of a training."""
+    return output_dir / "configs" / f"{training}.json"
 
 
-def check_settings(preset: Preset, output_dir: Path) -> None:
-    """Note a preset's settings in the folder it writes to; refuse one that was made with others.
+def write_settings(preset: Preset, output_dir: Path) -> None:
+    """Write the resolved settings of an experiment into its folder, unless it was made with different ones.
 
-    What is finished there is not made again: with changed settings, tables would join results of both.
+    Finished stages are not repeated, so after a change the tables would mix results of both settings. What changes no
+    result is not compared: which arms run, filmed rollouts, expected minutes, descriptions.
 
     Args:
-        preset: Its settings files are read.
-        output_dir: Where everything is written; made if it is not there.
+        preset: Its settings.
+        output_dir: Where everything is written; created if needed.
 
     Raises:
-        ValueError: Names the file, what has changed, and how to go on.
+        ValueError: Settings have changed; names them.
     """
+    sizes = {key: value for key, value in vars(preset).items() if not isinstance(value, dict)}
+    arms = {name: {**asdict(arm), "description": ""} for name, arm in ARMS.items()}
+    del sizes["videos_per_task"]
+    # Through JSON, as the earlier settings.
+    now = json.loads(json.dumps({"sizes": sizes, "trainings": preset.trainings, "arms": arms}))
     path = output_dir / SETTINGS_NAME
-    known: dict[str, dict[str, Any]] = json.loads(path.read_text()) if path.is_file() else {}
-    now = {file.name: json.loads(file.read_text()) for file in sorted(preset.folder.glob("*.json"))}
-    for name in _CHANGE_NOTHING_MADE:
-        now[PRESET_FILE].pop(name)
-    for file, settings in now.items():
-        before = known.get(file, settings)
-        changed = [key for key in {**before, **settings} if before.get(key) != settings.get(key)]
-        if changed:
-            raise ValueError(_refusal(output_dir, changed, preset.folder / file))
-    arms = json.loads(
-        json.dumps({name: asdict(arm) for name, arm in ARMS.items()})
-    )  # as the earlier ones are read
-    before = known.get(_ARMS, {})
+    known = json.loads(path.read_text()) if path.is_file() else {}
     changed = [
-        name for name in arms if before.get(name, arms[name]) != arms[name]
-    ]  # a new one changes nothing
+        f"{section}.{name}"
+        for section, entries in now.items()
+        for name, value in entries.items()
+        # A new entry changes nothing that exists.
+        if known.get(section, {}).get(name, value) != value
+    ]
     if changed:
-        raise ValueError(_refusal(output_dir, changed, Path("lerobot_wm/experiment/arms.py")))
-    write_whole(path, json.dumps(known | now | {_ARMS: arms}, indent=1) + "\n")
-
-
-def _refusal(output_dir: Path, changed: list[str], file: Path) -> str:
-    return (
-        f"{output_dir} was made with other settings: {', '.join(changed)} of {file}. Set them back or give another "
-        "--output_dir; or remove there what depends on them, the own_records*.jsonl among it, and "
-        f"{output_dir / SETTINGS_NAME}."
-    )
+        raise ValueError(
+            f"{output_dir} was made with other settings of {', '.join(changed)}: compare {path} with the preset "
+            f"'{preset.name}' and report/arms.py. Change them back or use another --output_dir. To keep the folder, "
+            f"delete {path}, own_records*.jsonl and all results that depend on these settings."
+        )
+    write_whole(path, json.dumps(now, indent=1) + "\n")
+    for training, settings in preset.trainings.items():
+        write_whole(config_file(output_dir, training), json.dumps(settings, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""`scripts/reproduce_table1.py`: any arms and seeds of the experiment, from nothing to the table."""
+"""`scripts/reproduce_table1.py`: any arms and seeds of the experiment, from demonstrations to the table."""
 
 import argparse
 import fcntl
@@ -12,20 +12,20 @@ from typing import IO
 from rich.console import Console
 
 from lerobot_wm.constants import REPORTED_VARIATION_SET, VARIATION_SETS
-from lerobot_wm.experiment.arms import ARMS
 from lerobot_wm.experiment.experiment import Experiment
 from lerobot_wm.experiment.plan import Plan
-from lerobot_wm.experiment.preset import check_settings, load_preset, select_runs
+from lerobot_wm.experiment.preset import load_preset, select_runs, write_settings
 from lerobot_wm.experiment.stage import Stage
+from lerobot_wm.report.arms import ARMS
 from lerobot_wm.system import usable_cores
 
 
 @contextmanager
-def exclusive(output_dir: Path) -> Iterator[IO]:
+def hold_lock(output_dir: Path) -> Iterator[IO]:
     """Hold a folder's lock, which its running stages hold too.
 
     Raises:
-        BlockingIOError: another run, or a stage that a killed run left behind, is at work there.
+        BlockingIOError: Another run, or a stage that a killed run left behind, still writes there.
     """
     output_dir.mkdir(parents=True, exist_ok=True)
     with (output_dir / ".lock").open("w") as lock:
@@ -33,32 +33,33 @@ def exclusive(output_dir: Path) -> Iterator[IO]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise BlockingIOError(
-                f"Another run, or a stage that a killed run left behind, is at work in {output_dir}: wait until it "
-                "has ended, end it, or give another --output_dir."
+                f"Another run, or a stage that a killed run left behind, still writes to {output_dir}: wait until it "
+                "has ended, stop it, or use another --output_dir."
             ) from error
         yield lock
 
 
-LOG_TAIL = 15  # lines of a failed stage's log that are shown
+# Lines of a failed stage's log that are shown.
+LOG_TAIL = 15
 
 
 def show_failures(failed: list[Stage], console: Console) -> None:
-    """Name what failed, each with the end of its log."""
+    """Print the name of each failed stage and the end of its log."""
     for stage in failed:
         lines = stage.log.read_text(errors="replace").splitlines()[-LOG_TAIL:]
         console.print(f"\n[red]{stage.name} failed.[/] The end of {stage.log}:", highlight=False)
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line."""
+def make_parser() -> argparse.ArgumentParser:
+    """Define the command line."""
     parser = argparse.ArgumentParser(
-        description="Table 1 of the paper with controls: any arms and seeds, from demonstrations to the report. Safe "
-        "to stop and start again: finished stages are never repeated, trainings go on from their last checkpoint, "
-        "and an arm and seed whose records are complete counts as done.",
+        description="Table 1 of the paper with controls: any arms and seeds, from demonstrations to the report. "
+        "You can stop it and run it again: finished stages are not repeated, training resumes from its last "
+        "checkpoint, and an arm and seed whose records are complete does not run.",
         epilog=f"Arms: {', '.join(ARMS)}.",
     )
-    parser.add_argument("--preset", required=True, help="a folder of configs/ with an experiment.json")
+    parser.add_argument("--preset", required=True, help="NAME of configs/NAME.json")
     parser.add_argument("--arms", default="", help="names separated by commas; the preset's by default")
     parser.add_argument(
         "--seeds", default="", help="training seeds separated by commas; the preset's by default"
@@ -66,26 +67,28 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--output_dir", type=Path, help="outputs/PRESET by default")
     parser.add_argument("--results_dir", type=Path, help="committed records; results/PRESET by default")
     parser.add_argument(
-        "--processes", type=int, default=usable_cores(), help="stages side by side (%(default)s)"
+        "--processes", type=int, default=usable_cores(), help="how many stages run side by side (%(default)s)"
     )
     parser.add_argument(
         "--variation_set",
         type=int,
         choices=VARIATION_SETS,
         default=REPORTED_VARIATION_SET,
-        help="positions to roll out on: 42 is the table, 43 is for choosing settings, 44 for confirming; each is "
-        "recorded apart",
+        help="variations to roll out on: 42 to report, 43 to tune, 44 to confirm; recorded in separate files "
+        "(%(default)s)",
     )
     parser.add_argument(
-        "--quality", action="store_true", help="judge the world model, too (lerobot-wm quality)"
+        "--quality", action="store_true", help="also measure the world model's quality (lerobot-wm quality)"
     )
-    parser.add_argument("--list", action="store_true", help="print the stages and their state, then exit")
+    parser.add_argument(
+        "--list", action="store_true", help="print the stages and their state, and exit; writes nothing"
+    )
     return parser
 
 
 def main() -> None:
     """Entry point of `scripts/reproduce_table1.py`."""
-    args = parser().parse_args()
+    args = make_parser().parse_args()
     console = Console()
     try:
         preset = load_preset(args.preset)
@@ -98,22 +101,23 @@ def main() -> None:
         if args.list:
             Experiment(plan, runs, results_dir, args.processes, args.quality).show(console)
             return
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
-        with exclusive(output_dir) as lock:
-            check_settings(preset, output_dir)
+        # Stop as on Ctrl-C.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with hold_lock(output_dir) as lock:
+            write_settings(preset, output_dir)
             experiment = Experiment(plan, runs, results_dir, args.processes, args.quality)
-            experiment.tell_committed(console)
+            experiment.name_committed(console)
             failed = experiment.run(lock, console)
             reported = experiment.report()
     except (ValueError, OSError) as error:
         sys.exit(f"reproduce_table1: {error}")
     except KeyboardInterrupt:
-        sys.exit("\nStopped. The same command goes on from here.")
+        sys.exit("\nStopped. Run the same command again to resume.")
     show_failures(failed, console)
     if failed:
-        sys.exit(f"{len(failed)} stages failed; the same command tries them again.")
+        sys.exit(f"{len(failed)} stages failed. Run the same command to try them again.")
     if not reported:
-        sys.exit("The report failed, for the reason above; the records are complete.")
+        sys.exit("The report failed for the reason above. The records are complete.")
 
 
 def _names(comma_separated: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Running stages side by side: in the order of what waits for them, within the machine's cores."""
+"""Running stages side by side: the longest chains first, within the machine's cores."""
 
 import json
 import os
@@ -21,11 +21,11 @@ from lerobot_wm.system import held_back
 
 
 class Times:
-    """`times.json`: {stage: {"kind", "seconds"}} for every stage that ended well.
+    """`times.json`: {stage: {"kind", "seconds"}} for every stage that succeeded.
 
     Args:
         path: The file.
-        expected: Minutes of each kind of stage, until one of them has been measured.
+        expected: Minutes of each kind of stage, used until one has been measured.
     """
 
     def __init__(self, path: Path, expected: Mapping[str, float]) -> None:
@@ -33,22 +33,22 @@ class Times:
         self._expected = expected
         self._measured: dict[str, dict] = json.loads(path.read_text()) if path.is_file() else {}
 
-    def note(self, stage: Stage, seconds: float) -> None:
-        """Add a finished stage, measured from its start: not one that went on from a checkpoint."""
+    def record(self, stage: Stage, seconds: float) -> None:
+        """Add a finished stage that ran from the beginning, not from a checkpoint."""
         self._measured[stage.name] = {"kind": stage.kind, "seconds": round(seconds, 1)}
         write_whole(self._path, json.dumps(self._measured, indent=1) + "\n")
 
     def minutes(self, kind: str) -> float:
-        """How long a stage of this kind takes: the mean of those measured, else what the preset states.
+        """How long a stage of this kind takes: the mean of those measured, else what the preset says.
 
         Raises:
-            ValueError: none was measured and the preset does not say.
+            ValueError: None was measured and the preset has no entry.
         """
         seconds = [entry["seconds"] for entry in self._measured.values() if entry["kind"] == kind]
         if seconds:
             return sum(seconds) / len(seconds) / 60
         if kind not in self._expected:
-            raise ValueError(f"The preset's experiment.json states no minutes for '{kind}'; add them there.")
+            raise ValueError(f"The preset has no 'minutes' of '{kind}': add an estimate.")
         return self._expected[kind]
 
 
@@ -56,14 +56,15 @@ def ranks(stages: Mapping[str, Stage], minutes: Mapping[str, float]) -> dict[str
     """Minutes from the start of each stage to the end of the longest chain of stages that wait for it.
 
     Args:
-        stages: In an order in which each comes after those it needs.
-        minutes: Of each of them.
+        stages: Each after those it needs.
+        minutes: The expected time of each stage.
 
     Returns:
-        The upward rank of list scheduling (Topcuoglu et al. 2002): the highest is to be started first.
+        The upward rank of list scheduling (Topcuoglu et al. 2002): the highest starts first.
     """
     after = dict.fromkeys(stages, 0.0)
-    for name in reversed(list(stages)):  # those that wait for a stage come before it
+    # Reversed, those that wait for a stage come before it.
+    for name in reversed(list(stages)):
         for need in stages[name].needs:
             if need.name in after:
                 after[need.name] = max(after[need.name], minutes[name] + after[name])
@@ -71,33 +72,34 @@ def ranks(stages: Mapping[str, Stage], minutes: Mapping[str, float]) -> dict[str
 
 
 def minutes_left(stages: Mapping[str, Stage], minutes: Mapping[str, float], processes: int) -> float:
-    """A lower bound of the minutes `processes` side by side need: the longest chain, or their share of the sum."""
+    """A lower bound of the minutes that `processes` need: the longest chain, or their share of the sum."""
     longest = max(ranks(stages, minutes).values(), default=0.0)
     return max(longest, sum(minutes[name] for name in stages) / processes)
 
 
-STOP_SECONDS = 20.0  # from being asked to end until being made to
+# From SIGTERM to SIGKILL.
+STOP_SECONDS = 20.0
 
 
-class Running:
-    """Starts a stage.
+class StageProcess:
+    """A stage's subprocess, started when this is created.
 
     Args:
         stage: What to run.
         cores: How many cores it may use.
-        lock: Held open by the subprocess too: a lock on it lasts until the last stage has ended, also where
-            this process was killed.
+        lock: The subprocess holds it open too: a lock on it lasts until the last stage has ended, even if this
+            process is killed.
     """
 
     def __init__(self, stage: Stage, cores: int, lock: IO) -> None:
         self.stage = stage
-        self.resumed = stage.resumes  # from a checkpoint: its time is that of a part
+        self.resumed = stage.is_resumable
         self._started = time.monotonic()
         command = stage.command(cores)
         stage.prepare()
         with stage.log.open("a") as log:
             print("$", shlex.join(command), file=log, flush=True)
-            # In a process group of its own: Ctrl-C reaches this process alone, which then ends the group.
+            # In its own process group: Ctrl-C reaches only this process, which then stops the group.
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -110,7 +112,7 @@ class Running:
 
     @property
     def returncode(self) -> int | None:
-        """None while it runs."""
+        """Its exit code; None while it runs."""
         return self._process.poll()
 
     @property
@@ -124,16 +126,16 @@ class Running:
             os.killpg(self._process.pid, number)
 
     def wait(self, seconds: float | None = None) -> None:
-        """Wait for its end.
+        """Wait until it has ended.
 
         Raises:
-            subprocess.TimeoutExpired: it runs on.
+            subprocess.TimeoutExpired: It is still running.
         """
         self._process.wait(seconds)
 
 
-def stop(running: Sequence[Running]) -> None:
-    """End stages: all are asked at once, and made to after a while."""
+def stop(running: Sequence[StageProcess]) -> None:
+    """Terminate stages, and kill those that have not ended after `STOP_SECONDS`."""
     for work in running:
         work.signal(signal.SIGTERM)
     end = time.monotonic() + STOP_SECONDS
@@ -146,15 +148,15 @@ def stop(running: Sequence[Running]) -> None:
 
 
 def environment(cores: int) -> dict[str, str]:
-    """A stage's environment: its share of the cores, headless rendering, nothing fetched from the Hub."""
+    """A stage's environment: its share of the cores, headless rendering, no access to the Hub."""
     variables = {"HF_HUB_OFFLINE": "1", "MUJOCO_GL": "egl", **os.environ, "OMP_NUM_THREADS": str(cores)}
-    # Without bytecode files, which this variable forbids, each command spends seconds more on its imports.
+    # This variable forbids bytecode files, without which each command takes seconds longer to import.
     variables.pop("PYTHONDONTWRITEBYTECODE", None)
     return variables
 
 
 class Progress:
-    """Lines for what starts and ends, and on a terminal a live view below them. A context manager."""
+    """Prints a line when a stage starts or ends, and on a terminal a live view below. A context manager."""
 
     def __init__(self, console: Console, times: Times, processes: int, total: int) -> None:
         self._console = console
@@ -173,12 +175,12 @@ class Progress:
         self._live.stop()
 
     def started(self, stage: Stage) -> None:
-        """Say that a stage starts, or where it goes on."""
-        how = "goes on" if stage.resumes else "starts"
-        self._console.print(f"{stage.name} {how}; log: {stage.log}", highlight=False, soft_wrap=True)
+        """Print that a stage starts or resumes."""
+        verb = "resumes" if stage.is_resumable else "starts"
+        self._console.print(f"{stage.name} {verb}; log: {stage.log}", highlight=False, soft_wrap=True)
 
     def finished(self, stage: Stage, seconds: float) -> None:
-        """Say that a stage ended well."""
+        """Print that a stage succeeded."""
         self._done += 1
         self._console.print(
             f"[green]{stage.name} done[/] in {minutes_text(seconds / 60)} ({self._done}/{self._total})",
@@ -186,12 +188,12 @@ class Progress:
         )
 
     def failed(self, stage: Stage, returncode: int) -> None:
-        """Say that a stage failed."""
-        why = f"exit code {returncode}" if returncode else f"it ended without writing {stage.artefact}"
+        """Print that a stage failed."""
+        why = f"exit code {returncode}" if returncode else f"it did not write {stage.artefact}"
         self._console.print(f"[red]{stage.name} failed[/] ({why})", highlight=False, soft_wrap=True)
 
-    def show(self, running: Sequence[Running], waiting: Mapping[str, Stage]) -> None:
-        """Renew the live view."""
+    def show(self, running: Sequence[StageProcess], waiting: Mapping[str, Stage]) -> None:
+        """Update the live view."""
         minutes = {name: self._times.minutes(stage.kind) for name, stage in waiting.items()}
         table = Table("running", "minutes", "of about", box=None)
         for work in running:
@@ -200,9 +202,7 @@ class Progress:
             minutes[work.stage.name] = max(0.0, expected - spent)
         stages = {work.stage.name: work.stage for work in running} | dict(waiting)
         left = minutes_left(stages, minutes, self._processes)
-        state = (
-            f"{self._done} of {self._total} stages done, {len(waiting)} wait; about {minutes_text(left)} left"
-        )
+        state = f"{self._done} of {self._total} stages done, {len(waiting)} waiting; about {minutes_text(left)} left"
         self._live.update(Group(table, Text(state)))
 
 
@@ -220,13 +220,13 @@ class Runner:
     Args:
         stages: Unfinished ones by name, each after those it needs.
         processes: How many run side by side at most.
-        cores: Cores of the machine; stages that run side by side share them.
+        cores: Cores of the machine, shared by the stages that run side by side.
         times: Measured and expected wall times.
-        progress: Shows what goes on.
-        on_finish: Called after each stage that ended well.
+        progress: Shows the progress.
+        on_finish: Called after each stage that succeeds.
 
     Raises:
-        ValueError: it is not known how long a kind of stage takes.
+        ValueError: There are no minutes for a kind of stage.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class Runner:
         on_finish: Callable[[Stage], None],
     ) -> None:
         self._waiting = dict(stages)
-        self._running: list[Running] = []
+        self._running: list[StageProcess] = []
         self._failed: list[Stage] = []
         self._processes = processes
         self._cores = cores
@@ -249,10 +249,9 @@ class Runner:
         self._ranks = ranks(stages, {name: times.minutes(stage.kind) for name, stage in stages.items()})
 
     def run(self, lock: IO) -> list[Stage]:
-        """Run until nothing can run any more; returns the stages that failed.
+        """Run until nothing can run any more, and return the stages that failed.
 
-        A stage that fails takes those with it that need its result; the others go on. The stages at work end
-        with this call, however it ends.
+        Stages that need a failed one do not run; the others do. Running stages are stopped if this call is interrupted.
 
         Args:
             lock: A file that every stage holds open.
@@ -274,12 +273,12 @@ class Runner:
         ready = [
             stage for stage in self._waiting.values() if not missing & {need.name for need in stage.needs}
         ]
-        ready.sort(key=lambda stage: -self._ranks[stage.name])  # first the one that most waits for
+        ready.sort(key=lambda stage: -self._ranks[stage.name])
         side_by_side = min(self._processes, len(self._running) + len(ready))
         for stage in ready[: self._processes - len(self._running)]:
             self._progress.started(stage)
             with held_back(signal.SIGINT, signal.SIGTERM):
-                self._running.append(Running(stage, max(1, self._cores // side_by_side), lock))
+                self._running.append(StageProcess(stage, max(1, self._cores // side_by_side), lock))
             del self._waiting[stage.name]
 
     def _reap(self) -> None:
@@ -287,9 +286,9 @@ class Runner:
             if work.returncode is None:
                 continue
             self._running.remove(work)
-            if work.returncode == 0 and work.stage.finished:
+            if work.returncode == 0 and work.stage.is_finished:
                 if not work.resumed:
-                    self._times.note(work.stage, work.seconds)
+                    self._times.record(work.stage, work.seconds)
                 self._progress.finished(work.stage, work.seconds)
                 self._on_finish(work.stage)
             else:

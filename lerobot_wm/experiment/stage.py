@@ -1,4 +1,4 @@
-"""A stage of the experiment: one command, and the file that says it is finished."""
+"""A stage of the experiment: one command, and the file that shows that it is finished."""
 
 import shutil
 import sys
@@ -13,15 +13,15 @@ class Stage:
 
     Args:
         name: Unique within the experiment.
-        kind: Stages of one kind take about as long.
+        kind: Stages of one kind take about equally long.
         argv: Its command.
-        folder: What it writes; a start from nothing removes it first.
-        artefact: The file it writes last: there is one exactly when the stage is finished.
+        folder: What it writes. It is removed before the stage starts from the beginning.
+        artefact: The file it writes last; it exists exactly when the stage is finished.
         needs: Stages that must be finished before.
-        checkpoint: The file or folder a stopped stage goes on from; None when it has to start from nothing.
-        is_there: Whether the checkpoint is; where a kill can leave it hidden, it is brought back first.
-        resume_argv: The command to go on with; none where `argv` itself goes on.
-        takes_workers: Whether it spreads over the cores it is given by `--num_workers`.
+        checkpoint: The file or folder from which a stopped stage resumes; None where it starts from the beginning.
+        can_resume: Whether the stage can resume from the checkpoint; writes nothing.
+        resume_argv: The command that resumes it; empty where `argv` does that too.
+        takes_workers: Whether it uses several cores by `--num_workers`.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Stage:
     artefact: Path
     needs: tuple["Stage", ...] = ()
     checkpoint: Path | None = None
-    is_there: Callable[[Path], bool] = Path.exists
+    can_resume: Callable[[Path], bool] = Path.exists
     resume_argv: tuple[str, ...] = ()
     takes_workers: bool = False
 
@@ -41,45 +41,38 @@ class Stage:
         return self.folder.with_name(f"{self.folder.name}.log")
 
     @property
-    def finished(self) -> bool:
-        """Whether its artefact is there."""
+    def is_finished(self) -> bool:
+        """Whether its artefact exists."""
         return self.artefact.exists()
 
     @property
-    def resumes(self) -> bool:
-        """Whether a stopped run of it left something to go on from."""
-        return self.checkpoint is not None and self.is_there(self.checkpoint)
+    def is_resumable(self) -> bool:
+        """Whether a stopped run of it left a checkpoint."""
+        return self.checkpoint is not None and self.can_resume(self.checkpoint)
 
     def command(self, cores: int) -> list[str]:
         """The command to run now, with the cores it may use."""
-        argv = self.resume_argv if self.resumes and self.resume_argv else self.argv
+        argv = self.resume_argv if self.is_resumable and self.resume_argv else self.argv
         return [*argv, f"--num_workers={cores}"] if self.takes_workers else list(argv)
 
     def prepare(self) -> None:
-        """Make room: the folder of its log, and no left-overs where it starts from nothing."""
+        """Create the folder of its log, and remove what an earlier run left unless it can be resumed."""
         self.folder.parent.mkdir(parents=True, exist_ok=True)
-        if not self.resumes and self.folder.exists():
+        if not self.is_resumable and self.folder.exists():
             shutil.rmtree(self.folder)
 
 
-def in_order(targets: Iterable[Stage]) -> dict[str, Stage]:
-    """`targets` and all they need, by name, each after those it needs."""
-    return _closure(targets, lambda stage: True)
+def in_order(targets: Iterable[Stage], include_finished: bool = True) -> dict[str, Stage]:
+    """`targets` and all stages they need, by name, each after those it needs.
 
-
-def unfinished(targets: Iterable[Stage]) -> dict[str, Stage]:
-    """The stages still to run for `targets`, by name, each after those it needs.
-
-    What a finished stage needed is not looked at: it may have been removed since.
+    Args:
+        targets: Last stages.
+        include_finished: Without them, what a finished stage needed is left out too: it may have been removed since.
     """
-    return _closure(targets, lambda stage: not stage.finished)
-
-
-def _closure(targets: Iterable[Stage], wanted: Callable[[Stage], bool]) -> dict[str, Stage]:
     stages: dict[str, Stage] = {}
 
     def visit(stage: Stage) -> None:
-        if stage.name not in stages and wanted(stage):
+        if stage.name not in stages and (include_finished or not stage.is_finished):
             for need in stage.needs:
                 visit(need)
             stages[stage.name] = stage
@@ -89,8 +82,13 @@ def _closure(targets: Iterable[Stage], wanted: Callable[[Stage], bool]) -> dict[
     return stages
 
 
+def unfinished(targets: Iterable[Stage]) -> dict[str, Stage]:
+    """The stages that must still run for `targets`, by name, each after those it needs."""
+    return in_order(targets, include_finished=False)
+
+
 def lerobot_wm(command: str, flags: Mapping[str, object], *more: str) -> tuple[str, ...]:
-    """`lerobot-wm COMMAND --FLAG=VALUE ...` for the Python that runs this; `more` are flags written out."""
+    """`lerobot-wm COMMAND --FLAG=VALUE ...` for this Python interpreter; `more` are complete flags."""
     written = (f"--{name}={value}" for name, value in flags.items())
     return (sys.executable, "-m", "lerobot_wm.cli", command, *written, *more)
 

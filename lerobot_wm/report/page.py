@@ -9,7 +9,8 @@ from lerobot_wm.inspect.html import SVG, data_uri, figure_bytes, short, template
 from lerobot_wm.inspect.latent_map import LatentMap
 from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, OpenLoop
 from lerobot_wm.records import Record, by_task
-from lerobot_wm.report.comparison import ARMS, by_arm
+from lerobot_wm.report.arms import ARMS
+from lerobot_wm.report.comparison import by_arm
 from lerobot_wm.report.data_summary import DataSummary
 from lerobot_wm.report.success import (
     comparison_tables,
@@ -160,7 +161,10 @@ def page_of_records(title: str, records: list[Record], clips: list[Clip]) -> Pag
     inlined = within_limit(clips)
     page = Page(
         title=title,
-        arms=[(arm, runs[0]["preset"], ARMS.get(arm, "")) for arm, runs in by_arm(records).items()],
+        arms=[
+            (arm, runs[0]["preset"], ARMS[arm].description if arm in ARMS else "")
+            for arm, runs in by_arm(records).items()
+        ],
         n_rollouts=len(records),
         tables=[task_table("Success per task", records), overall_table(records)],
         detail_tables=_detail_tables(records),

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import pytest
 
 from lerobot_wm.constants import MT6
-from lerobot_wm.report.comparison import ARMS, by_arm
+from lerobot_wm.report.arms import ARMS
+from lerobot_wm.report.comparison import by_arm
 from lerobot_wm.report.success import (
     PAPER_TABLE,
     comparison_tables,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from rich.console import Console
 
-from lerobot_wm.report.comparison import ARMS
+from lerobot_wm.report.arms import ARMS
 from lerobot_wm.report.success import comparison_tables, overall_table, paper_comparison, task_table
 from lerobot_wm.statistics import SuccessRate
 from lerobot_wm.tables import ReportTable, markdown_table, table_by_split, terminal_tables
