@@ -112,12 +112,13 @@ def explain_how_to_resume(output_dir: Path) -> Iterator[None]:
 
 
 def is_complete(checkpoint: Path) -> bool:
-    """Whether the file that LeRobot writes last into a checkpoint is there and can be read."""
+    """Whether a checkpoint has its step, and the file that LeRobot writes last into it."""
     try:
+        _step_of(checkpoint)
         config = json.loads((checkpoint / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).read_text())
         written_last = SCHEDULER_STATE if config["scheduler"] is not None else OPTIMIZER_PARAM_GROUPS
         json.loads((checkpoint / TRAINING_STATE_DIR / written_last).read_text())
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         return False
     return True
 

@@ -5,36 +5,36 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 
 class DivergenceError(RuntimeError):
     """A loss or a weight is NaN or infinite. The message is one line: what, and what to do."""
 
 
-def check_finite(loss: Tensor, parts: Mapping[str, float], config: object, batch: Mapping[str, Any]) -> None:
+def check_finite(numbers: Mapping[str, float], config: object, batch: Mapping[str, Any]) -> None:
     """Stop a training whose loss is not finite.
 
-    A policy calls it at the end of `forward`, so that `lerobot-train` stops as `lerobot-wm train` does.
+    Every policy's `forward` calls it, so that `lerobot-train` stops as `lerobot-wm train` does.
 
     Args:
-        loss: The scalar loss.
-        parts: The numbers it was made of, by name.
+        numbers: The loss and its parts, by name.
         config: The policy's configuration, whose settings the message advises on.
         batch: The training batch; its episodes are named where it has `episode_index`.
 
     Raises:
-        DivergenceError: The loss or one of its parts is NaN or infinite.
+        DivergenceError: A number is NaN or infinite.
     """
-    broken = [name for name, value in parts.items() if not math.isfinite(value)]
-    if not broken and bool(loss.detach().isfinite()):
+    broken = [name for name, value in numbers.items() if not math.isfinite(value)]
+    if not broken:
         return
-    what = f"the loss ({', '.join(broken)})" if broken else "the loss"
     where = ""
     if "episode_index" in batch:
         episodes = batch["episode_index"].unique().tolist()  # sorted
         where = f" on a batch of episodes {', '.join(map(str, episodes))}"
-    raise DivergenceError(f"Training diverged: {what} is NaN or infinite{where}. {_advice(config)}")
+    raise DivergenceError(
+        f"Training diverged: {', '.join(broken)} is NaN or infinite{where}. {_advice(config)}"
+    )
 
 
 def check_finite_weights(policy: nn.Module, config: object) -> None:
