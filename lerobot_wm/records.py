@@ -1,4 +1,4 @@
-"""Records: one JSON line per rollout, written by `lerobot-wm eval` and read by `lerobot-wm report`."""
+"""Records: one JSON line per rollout, the success rates computed from them, and what produced a result."""
 
 import gzip
 import json
@@ -7,12 +7,14 @@ import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from glob import glob
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict, cast
 
-import torch
+import numpy as np
+from scipy.stats import binomtest, trim_mean
 
 from lerobot_wm.files import sole_writer
 from lerobot_wm.system import cpu_kind, usable_cores
@@ -24,18 +26,29 @@ Record = TypedDict(
         "arm": str,
         "policy_type": str,
         "preset": str,
-        "seed": int | None,  # training seed of the policy; None when the checkpoint does not tell
+        # The policy's training seed; None where the checkpoint does not say.
+        "seed": int | None,
         "task": str,
-        "variation": int,  # Meta-World: one of the 50 fixed variations; elsewhere: the environment's seed
-        "seen": bool | None,  # was the variation collected on? None where the notion does not exist
+        # In Meta-World one of the 50 fixed variations, elsewhere the environment's seed.
+        "variation": int,
+        # Whether demonstrations were collected on this variation; None outside Meta-World.
+        "seen": bool | None,
         "success": bool,
-        "steps": int,  # environment steps until the episode ended
-        "return": float,  # sum of rewards over those steps
-        "variation_set": NotRequired[
-            int | None
-        ],  # Meta-World: the set of the variation; older records lack it
+        # Environment steps until the episode ended.
+        "steps": int,
+        # Sum of rewards over those steps.
+        "return": float,
+        # Meta-World's variation set; missing in older records.
+        "variation_set": NotRequired[int | None],
     },
 )
+
+SPLITS = ("seen", "unseen", "all")
+N_RESAMPLES = 10_000
+# The same records give the same intervals.
+RNG_SEED = 0
+COMMAND = "command"
+PACKAGES = ("lerobot_policy_wm", "lerobot", "torch", "mujoco", "metaworld", "gymnasium", "numpy")
 
 
 def record_line(record: Record) -> str:
@@ -43,60 +56,77 @@ def record_line(record: Record) -> str:
     return json.dumps(record) + "\n"
 
 
-def find_records(patterns: str) -> list[Path]:
-    """Files named by a comma-separated list of paths and globs, sorted within each glob.
+@contextmanager
+def new_records(path: Path) -> Iterator[None]:
+    """Lock a new records file while its rollouts run; existing records are never overwritten.
 
     Raises:
-        FileNotFoundError: when an entry of the list matches no file.
+        FileExistsError: The file exists.
+        BlockingIOError: Another process is writing it.
+    """
+    with sole_writer(path):
+        if path.exists():
+            raise FileExistsError(
+                f"{path} holds the records of an earlier evaluation. Remove it, or choose another --output_dir (or "
+                "--records for lerobot-wm eval)."
+            )
+        yield
+
+
+def find_records(patterns: str) -> list[Path]:
+    """Find the files that a comma-separated list of paths and globs names, sorted within each glob.
+
+    Raises:
+        FileNotFoundError: An entry of the list matches no file.
     """
     paths: list[Path] = []
     for pattern in patterns.split(","):
         found = sorted(glob(pattern.strip(), recursive=True))
         if not found:
-            raise FileNotFoundError(f"No records at '{pattern}': expected files of `lerobot-wm eval`.")
+            raise FileNotFoundError(
+                f"No file matches '{pattern}': expected records written by `lerobot-wm eval`."
+            )
         paths += [Path(path) for path in found if Path(path) not in paths]
     return paths
 
 
 def read_records(paths: Iterable[Path]) -> list[Record]:
-    """All records of the files, in order; files named .gz are compressed.
+    """Read all records of the files, in order; files named .gz are compressed.
 
     Raises:
-        ValueError: when a line is not a record, when a rollout occurs twice, when one arm has two presets, when a
-            variation is of another set here than there, or when there is no record at all.
+        ValueError: There is no record, a line is not a record, a rollout occurs twice, an arm has two presets, or
+            variations of different sets would be compared.
     """
     records: list[Record] = []
-    origins: dict[tuple, str] = {}
-    presets: dict[str, str] = {}
-    positions: dict[tuple[str, int, str], tuple[Any, str]] = {}
+    # Where each fact was first read: what must agree -> (value, place).
+    first_read: dict[tuple, tuple[Any, str]] = {}
     for path in paths:
-        for number, line in enumerate(_lines(path), start=1):
-            record = _parse(line, where=f"{path}:{number}")
+        for number, line in enumerate(_read_lines(path), start=1):
+            place = f"{path}:{number}"
+            record = _parse(line, place)
             rollout = (record["arm"], record["seed"], record["task"], record["variation"])
-            if rollout in origins:
+            _, first_place = first_read.setdefault(rollout, (True, place))
+            if first_place != place:
                 raise ValueError(
-                    f"{path}:{number} repeats the rollout (arm, seed, task, variation) = {rollout} of "
-                    f"{origins[rollout]}. Give each run once, and different runs different --arm names."
+                    f"{place} repeats the rollout (arm, seed, task, variation) = {rollout} of {first_place}. Give each "
+                    "run once, and evaluate different runs under different --arm names."
                 )
-            origins[rollout] = f"{path}:{number}"
-            preset = presets.setdefault(record["arm"], record["preset"])
+            preset, first_place = first_read.setdefault(("preset", record["arm"]), (record["preset"], place))
             if preset != record["preset"]:
                 raise ValueError(
-                    f"{path}:{number}: arm '{record['arm']}' has preset '{record['preset']}' here, '{preset}' before. "
-                    "The seeds of an arm are pooled: report the presets apart, or evaluate under another --arm."
+                    f"{place}: arm '{record['arm']}' has preset '{record['preset']}', but '{preset}' at {first_place}. "
+                    "The seeds of an arm are pooled: report each preset by itself, or evaluate under another --arm."
                 )
-            for name in ("seen", "variation_set"):
-                if name not in record:
+            for key in ("seen", "variation_set"):
+                if key not in record:
                     continue
-                fact = record[name]
-                first, origin = positions.setdefault(
-                    (record["task"], record["variation"], name), (fact, origins[rollout])
-                )
-                if first != fact:
+                position = (key, record["task"], record["variation"])
+                value, first_place = first_read.setdefault(position, (record[key], place))
+                if value != record[key]:
                     raise ValueError(
-                        f"{path}:{number}: variation {record['variation']} of {record['task']} has {name} {fact} "
-                        f"here, {first} at {origin}: positions of different sets (--env.variation_set), which "
-                        "cannot be compared one by one. Report each set apart."
+                        f"{place}: variation {record['variation']} of {record['task']} has {key} {record[key]}, but "
+                        f"{value} at {first_place}. These are different variation sets (--env.variation_set), which "
+                        "cannot be compared: report each set by itself."
                     )
             records.append(record)
     if not records:
@@ -104,68 +134,167 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
     return records
 
 
-def _lines(path: Path) -> list[str]:
+def _read_lines(path: Path) -> list[str]:
     data = path.read_bytes()
     return (gzip.decompress(data) if path.suffix == ".gz" else data).decode().splitlines()
 
 
-def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Records by task, tasks in alphabetical order."""
-    found: dict[str, list[Record]] = {}
-    for record in records:
-        found.setdefault(record["task"], []).append(record)
-    return dict(sorted(found.items()))
-
-
-def _parse(line: str, where: str) -> Record:
+def _parse(line: str, place: str) -> Record:
     try:
-        record: Record = json.loads(line)
+        record = json.loads(line)
     except json.JSONDecodeError as error:
-        raise ValueError(f"{where} is not JSON ({error}): expected one record per line.") from error
+        raise ValueError(f"{place} is not JSON ({error}): expected one record per line.") from error
     expected = Record.__required_keys__
     if not isinstance(record, dict) or set(record) - Record.__optional_keys__ != expected:
         found = sorted(record) if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f"{where} is not a record: found {found}, expected the keys {sorted(expected)}.")
-    return record
+        raise ValueError(f"{place} is not a record: found {found}, expected the keys {sorted(expected)}.")
+    return cast(Record, record)
 
 
-COMMAND = "command"
-PACKAGES = ("lerobot_policy_wm", "lerobot", "torch", "mujoco", "metaworld", "gymnasium", "numpy")
+def group_by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Group records by task, in alphabetical order."""
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(record["task"], []).append(record)
+    return dict(sorted(groups.items()))
 
 
-def by_machine(results: list[dict[str, str]]) -> list[tuple[list[str], dict[str, str]]]:
-    """The commands of some results with what they share: versions and kind of machine."""
-    found: dict[tuple[tuple[str, str], ...], list[str]] = {}
-    for facts in results:
-        shared = tuple((name, fact) for name, fact in facts.items() if name != COMMAND)
-        found.setdefault(shared, []).append(facts[COMMAND])
-    return [(commands, dict(shared)) for shared, commands in found.items()]
+def is_in_split(record: Record, split: str) -> bool:
+    """Whether a record belongs to the split "seen", "unseen" or "all"; where `seen` is None, to "all" only."""
+    return split == "all" or record["seen"] is (split == "seen")
+
+
+def present_splits(records: Iterable[Record]) -> tuple[str, ...]:
+    """The splits that have records."""
+    known = {record["seen"] for record in records}
+    return tuple(split for split in SPLITS if split == "all" or (split == "seen") in known)
+
+
+@dataclass(frozen=True)
+class SuccessRate:
+    """`successes` of `n` independent rollouts, `n` >= 1."""
+
+    successes: int
+    n: int
+
+    @property
+    def percent(self) -> float:
+        """Successes in percent of the rollouts."""
+        return 100 * self.successes / self.n
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The Wilson 95% interval in percent (Wilson 1927); it holds for rates near 0 and 100 too."""
+        bounds = binomtest(self.successes, self.n).proportion_ci(confidence_level=0.95, method="wilson")
+        return 100 * bounds.low, 100 * bounds.high
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.successes}/{self.n}  {self.percent:.0f} [{low:.0f}, {high:.0f}]"
+
+
+def success_rate(records: Iterable[Record]) -> SuccessRate | None:
+    """The success rate over these records; None when there are none."""
+    successes = [record["success"] for record in records]
+    return SuccessRate(sum(successes), len(successes)) if successes else None
+
+
+def summarize_success(records: Iterable[Record]) -> dict[str, int | float | list[float]]:
+    """The rate under the keys of LeRobot's evaluation output, in percent; the interval is [low, high].
+
+    Args:
+        records: At least one.
+    """
+    rate = success_rate(records)
+    assert rate is not None
+    return {
+        "n_episodes": rate.n,
+        "n_success": rate.successes,
+        "pc_success": rate.percent,
+        "pc_success_ci95": list(rate.interval),
+    }
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A statistic of success rates and its 95% interval, in percent."""
+
+    percent: float
+    interval: tuple[float, float]
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.percent:.0f} [{low:.0f}, {high:.0f}]"
+
+
+@dataclass(frozen=True)
+class RunStatistics:
+    """Mean and interquartile mean (IQM) of an arm's scores; a score is one training seed's success on one task.
+
+    `single_run` says that some task has one training seed only, so that its variations were resampled instead.
+    """
+
+    mean: Estimate
+    iqm: Estimate
+    single_run: bool
+
+
+def run_statistics(records: list[Record]) -> RunStatistics:
+    """Mean and IQM over the scores of one arm, with percentile intervals of the stratified bootstrap.
+
+    Scores are resampled with replacement within each task, so the interval covers the spread between training seeds on
+    these variations. It is too narrow for a handful of seeds, and does not know that one multi-task policy's scores
+    depend on each other (tests/report/test_bootstrap.py measures both). Where a task has one seed, its rollouts are
+    resampled: then the interval covers the choice of variations, not the spread between seeds.
+    """
+    rng = np.random.default_rng(RNG_SEED)
+    scores, draws, single_run = [], [], False
+    for of_task in group_by_task(records).values():
+        successes: dict[int | None, list[bool]] = {}
+        for record in of_task:
+            successes.setdefault(record["seed"], []).append(record["success"])
+        task_scores = np.array([np.mean(of_seed) for of_seed in successes.values()])  # (R,)
+        if len(task_scores) > 1:
+            task_draws = resample(task_scores, rng)  # (N, R)
+        else:
+            [of_seed] = successes.values()
+            task_draws = resample(np.array(of_seed, float), rng).mean(axis=1, keepdims=True)  # (N, 1)
+            single_run = True
+        scores.append(task_scores)
+        draws.append(task_draws)
+    all_scores, all_draws = np.concatenate(scores), np.concatenate(draws, axis=1)  # (R·T,), (N, R·T)
+    return RunStatistics(
+        mean=Estimate(100 * all_scores.mean(), percentile_interval(100 * all_draws.mean(axis=1))),
+        iqm=Estimate(
+            100 * trim_mean(all_scores, 0.25), percentile_interval(100 * trim_mean(all_draws, 0.25, axis=1))
+        ),
+        single_run=single_run,
+    )
+
+
+def resample(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw from the values (n,) with replacement: (N_RESAMPLES, n)."""
+    return values[rng.integers(len(values), size=(N_RESAMPLES, len(values)))]
+
+
+def percentile_interval(draws: np.ndarray) -> tuple[float, float]:
+    """The 95% percentile interval of a statistic's bootstrap draws (N_RESAMPLES,)."""
+    low, high = np.percentile(draws, (2.5, 97.5))
+    return float(low), float(high)
 
 
 def provenance() -> dict[str, str]:
-    """What produced a result in this process: name -> value."""
-    command = f"{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}"
-    facts = {COMMAND: command, "python": platform.python_version()}
+    """What produces a result in this process, name -> value: command, package versions and kind of machine."""
+    # Reading records needs no torch.
+    import torch
+
+    facts = {
+        COMMAND: f"{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}",
+        "python": platform.python_version(),
+    }
     facts |= {package: version(package) for package in PACKAGES}
     facts["system"] = f"{platform.system()} {platform.machine()}"
     facts["CPU"] = cpu_kind()
     facts["CPU cores"] = str(usable_cores())
     facts["GPU"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return facts
-
-
-@contextmanager
-def new_records(path: Path) -> Iterator[None]:
-    """Hold a records file while its rollouts run; earlier records are never written over.
-
-    Raises:
-        FileExistsError: It is there already.
-        BlockingIOError: Another process writes it.
-    """
-    with sole_writer(path):
-        if path.exists():
-            raise FileExistsError(
-                f"{path} holds the records of an earlier evaluation: remove it, or give another --output_dir, or "
-                "--records of lerobot-wm eval."
-            )
-        yield

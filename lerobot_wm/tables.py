@@ -1,6 +1,6 @@
-"""The report's tables: one data structure for the terminal, for markdown and for the page's template."""
+"""Tables of results: one data structure for the terminal, for Markdown and for the report's page."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import batched
 
@@ -8,52 +8,74 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from lerobot_wm.records import Record, by_task
-from lerobot_wm.statistics import SPLITS, Estimate, SuccessRate, in_split, success_rate
+from lerobot_wm.records import (
+    Estimate,
+    Record,
+    SuccessRate,
+    group_by_task,
+    is_in_split,
+    present_splits,
+    success_rate,
+)
 
 # What a terminal of 100 columns holds beside the longest label.
 FULL_COLUMNS, COMPACT_COLUMNS = 3, 6
-SEEN = "Seen variations are those that demonstrations are collected on by default, 0-9 of set 42."
-WILSON = "Successes/rollouts, per cent, [Wilson 95% interval over rollouts]."
+SEEN = "Demonstrations are collected on the seen variations, by default 0-9 of set 42."
+WILSON = "Successes/rollouts, success in percent, [Wilson 95% interval over rollouts]."
 
-Cell = SuccessRate | Estimate | str | int | None
+
+@dataclass(frozen=True)
+class Measurement:
+    """A number, and beside it in small print what belongs to it."""
+
+    text: str
+    small: str
+
+    def __str__(self) -> str:
+        return f"{self.text} ({self.small})"
+
+
+Cell = SuccessRate | Estimate | Measurement | str | int | None
 
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Labelled rows of cells; a cell is None where there is nothing to show."""
+    """Labelled rows of cells.
+
+    Attributes:
+        title: The table's heading.
+        corner: What the row labels are.
+        columns: What the columns are.
+        rows: Each row's label and cells; None where there is nothing to show.
+        n_totals: How many of the last rows summarise all tasks.
+        notes: Paragraphs to show below the table.
+    """
 
     title: str
-    corner: str  # what the row labels are
+    corner: str
     columns: list[str]
-    rows: list[tuple[str, list[Cell]]]
-    n_totals: int = 0  # how many of the last rows are over all tasks
+    rows: Sequence[tuple[str, Sequence[Cell]]]
+    n_totals: int = 0
     notes: list[str] = field(default_factory=list)
 
 
 def table_by_split(title: str, records: list[Record]) -> ReportTable:
     """One arm's records: tasks down; seen, unseen and all variations across."""
-
-    def cells(chosen: list[Record]) -> list[Cell]:
-        return [success_rate(r for r in chosen if in_split(r, split)) for split in splits]
-
     splits = present_splits(records)
-    rows = [(task, cells(of_task)) for task, of_task in by_task(records).items()]
-    rows.append(("all tasks", cells(records)))
+
+    def rates(chosen: list[Record]) -> list[SuccessRate | None]:
+        return [success_rate(r for r in chosen if is_in_split(r, split)) for split in splits]
+
+    rows = [(task, rates(of_task)) for task, of_task in group_by_task(records).items()]
+    rows.append(("all tasks", rates(records)))
     notes = [WILSON, SEEN] if "seen" in splits else [WILSON]
     return ReportTable(title, "task", list(splits), rows, n_totals=1, notes=notes)
-
-
-def present_splits(records: Iterable[Record]) -> tuple[str, ...]:
-    """The splits that have records: "seen" and "unseen" only where the environment knows them."""
-    known = {record["seen"] for record in records}
-    return tuple(s for s in SPLITS if s == "all" or (s == "seen") in known)
 
 
 def terminal_tables(table: ReportTable) -> list[RenderableType]:
     """The table for rich's console in at most 100 characters, then its notes.
 
-    With more than three columns rates lose their counts ("88 76–94"); with more than six the table is cut.
+    With more than three columns rates lose their counts ("88 76–94"); with more than six the table is split.
     """
     compact = len(table.columns) > FULL_COLUMNS
     shown: list[RenderableType] = []
@@ -63,7 +85,7 @@ def terminal_tables(table: ReportTable) -> list[RenderableType]:
         for index in chosen:
             part.add_column(table.columns[index].removesuffix("-v3").replace("-", "\n"), justify="right")
         for number, (label, cells) in enumerate(table.rows, start=1):
-            texts = [_compact(cells[index]) if compact else cell_text(cells[index]) for index in chosen]
+            texts = [_compact_text(cells[index]) if compact else cell_text(cells[index]) for index in chosen]
             part.add_row(label, *texts, end_section=number == len(table.rows) - table.n_totals)
         shown.append(part)
     shown.append(Text("\n".join([*table.notes, ""]), style="dim"))
@@ -71,7 +93,7 @@ def terminal_tables(table: ReportTable) -> list[RenderableType]:
 
 
 def markdown_table(table: ReportTable) -> str:
-    """The table as GitHub markdown under a heading, its notes below."""
+    """The table as GitHub Markdown under a heading, its notes below."""
     lines = [f"## {table.title}", "", f"| {table.corner} | {' | '.join(table.columns)} |"]
     lines.append("|---|" + "---:|" * len(table.columns))
     lines += [f"| {label} | {' | '.join(map(cell_text, cells))} |" for label, cells in table.rows]
@@ -83,7 +105,7 @@ def cell_text(cell: Cell) -> str:
     return "–" if cell is None else str(cell)
 
 
-def _compact(cell: Cell) -> str:
+def _compact_text(cell: Cell) -> str:
     if isinstance(cell, SuccessRate | Estimate):
         low, high = cell.interval
         return f"{cell.percent:.0f} [dim]{low:.0f}–{high:.0f}[/dim]"

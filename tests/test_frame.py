@@ -23,8 +23,8 @@ LEVELS = {
     for level, names in enumerate(
         (
             ("constants", "files", "system"),
-            ("records", "statistics", "tables", "errors", "workers", "quiet", "markdown", "nn"),
-            ("world_model", "rl"),
+            ("records", "errors", "workers", "quiet", "markdown", "nn"),
+            ("tables", "world_model", "rl"),
             ("data", "envs"),
             ("policies",),
             ("collect", "train", "encode", "evaluate"),

@@ -11,9 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_wm.envs.tasks import resolve_tasks
-from lerobot_wm.records import read_records
+from lerobot_wm.records import is_in_split, read_records, success_rate
 from lerobot_wm.report.command import ReportConfig, report
-from lerobot_wm.statistics import in_split, success_rate
 
 ROOT = Path(__file__).resolve().parents[1]
 TASKS = sorted(resolve_tasks("mt6"))  # the order of the columns
@@ -44,7 +43,7 @@ def test_success_of_cpu_is_that_of_the_rollouts() -> None:
     assert {arm for arm, *_ in table} == {record["arm"] for record in records}
     for arm, _, *cells in table:
         of_arm = [record for record in records if record["arm"] == arm]
-        splits = [success_rate(r for r in of_arm if in_split(r, split)) for split in ("seen", "unseen")]
+        splits = [success_rate(r for r in of_arm if is_in_split(r, split)) for split in ("seen", "unseen")]
         n_seeds = len({record["seed"] for record in of_arm})
         assert cells == [str(n_seeds), *map(str, splits), str(success_rate(of_arm))], arm
 
@@ -58,7 +57,7 @@ def test_success_of_best_is_that_of_the_rollouts(heading: str, name: str) -> Non
     for arm, *cells in table:
         of_arm = [record for record in records if record["arm"] == arm]
         rates = [success_rate(r for r in of_arm if r["task"] == task) for task in TASKS]
-        unseen = str(success_rate(r for r in of_arm if in_split(r, "unseen"))).split("  ")[1]
+        unseen = str(success_rate(r for r in of_arm if is_in_split(r, "unseen"))).split("  ")[1]
         expected = [*(f"{rate.percent:.0f}" for rate in rates if rate), unseen, str(success_rate(of_arm))]
         assert cells == expected, arm
 
@@ -146,7 +145,7 @@ def test_the_rates_of_mt10_are_those_of_the_committed_rollouts() -> None:
             if task in resolve_tasks("mt10"):
                 chosen = [r for r in chosen if r["task"] == task]
             elif task != "all":
-                chosen = [r for r in chosen if in_split(r, task.split()[2])]
+                chosen = [r for r in chosen if is_in_split(r, task.split()[2])]
             assert cell == str(success_rate(chosen)), (task, arm)
 
 

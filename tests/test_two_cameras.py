@@ -12,7 +12,8 @@ from torch.utils.data import DataLoader
 
 from lerobot_wm.data.loader import RamLoader
 from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.inspect.open_loop import CONTEXT, load_world_model, open_loop, strips_figure
+from lerobot_wm.inspect.episodes import load_world_model
+from lerobot_wm.inspect.open_loop import CONTEXT, open_loop, strips_figure
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from tests.flags import TRAIN_FLAGS
 

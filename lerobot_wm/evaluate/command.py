@@ -25,8 +25,14 @@ from lerobot_wm.evaluate.wandb_log import log_evaluation, wandb_run
 from lerobot_wm.policies.common.checkpoint import check_policy_path, check_processors
 from lerobot_wm.policies.common.multi_task_config import MultiTaskConfig
 from lerobot_wm.quiet import drop_remarks
-from lerobot_wm.records import Record, new_records, provenance, record_line
-from lerobot_wm.statistics import ci95_summary, in_split
+from lerobot_wm.records import (
+    Record,
+    is_in_split,
+    new_records,
+    provenance,
+    record_line,
+    summarize_success,
+)
 from lerobot_wm.system import usable_cores
 from lerobot_wm.tables import table_by_split, terminal_tables
 from lerobot_wm.workers import map_in_workers
@@ -113,15 +119,15 @@ def _write_info(cfg: EvaluateConfig, records: list[Record], seconds: float) -> N
     """eval_info.json: success rates with intervals per task, per split and overall, and what made them."""
 
     def chosen(split: str) -> list[Record]:
-        return [record for record in records if in_split(record, split)]
+        return [record for record in records if is_in_split(record, split)]
 
     tasks = dict.fromkeys(record["task"] for record in records)
     info = {
         "arm": cfg.arm_name,
         "policy_path": str(cfg.policy.pretrained_path),
-        "per_task": {task: ci95_summary(r for r in records if r["task"] == task) for task in tasks},
-        **{split: ci95_summary(chosen(split)) for split in ("seen", "unseen") if chosen(split)},
-        "overall": ci95_summary(records),
+        "per_task": {task: summarize_success(r for r in records if r["task"] == task) for task in tasks},
+        **{split: summarize_success(chosen(split)) for split in ("seen", "unseen") if chosen(split)},
+        "overall": summarize_success(records),
         "eval_s": seconds,
         "provenance": provenance(),
     }

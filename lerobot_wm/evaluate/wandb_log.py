@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING
 from lerobot.configs.default import WandBConfig
 from lerobot.utils.import_utils import require_package
 
-from lerobot_wm.inspect.dream import Dreams
-from lerobot_wm.records import Record
-from lerobot_wm.statistics import ci95_summary, in_split
-from lerobot_wm.tables import cell_text, present_splits, table_by_split
+from lerobot_wm.records import Record, is_in_split, present_splits, summarize_success
+from lerobot_wm.tables import cell_text, table_by_split
 from lerobot_wm.train.resume import training_config
 
 if TYPE_CHECKING:
@@ -81,7 +79,9 @@ def log_evaluation(run: "wandb.Run", arm: str, records: list[Record]) -> None:
     rows = [[label, *map(cell_text, cells)] for label, cells in success.rows]
     rollouts = [list(record.values()) for record in records]
     per_cent = {
-        f"eval/pc_success_{split}": ci95_summary(r for r in records if in_split(r, split))["pc_success"]
+        f"eval/pc_success_{split}": summarize_success(r for r in records if is_in_split(r, split))[
+            "pc_success"
+        ]
         for split in present_splits(records)
     }
     run.log(
@@ -89,19 +89,5 @@ def log_evaluation(run: "wandb.Run", arm: str, records: list[Record]) -> None:
             "eval/success": wandb.Table(columns=[success.corner, *success.columns], data=rows),
             "eval/rollouts": wandb.Table(columns=list(records[0]), data=rollouts),
             **per_cent,
-        }
-    )
-
-
-def log_dream(run: "wandb.Run", dreams: Dreams, video: Path, strip: Path) -> None:
-    """Log a dream's video and strip, and the PSNR in dB of what it imagined and of a copied frame."""
-    import wandb
-
-    run.log(
-        {
-            "dream/video": wandb.Video(str(video), format="mp4"),
-            "dream/strip": wandb.Image(str(strip)),
-            "dream/psnr": dreams.psnr(),
-            "dream/copy_psnr": dreams.copy_psnr(),
         }
     )

@@ -1,6 +1,6 @@
-"""`lerobot-wm publish`: a finished checkpoint to the Hub in one commit, with a card that holds its results.
+"""`lerobot-wm publish`: upload a checkpoint to the Hub in one commit, with a card that shows its results.
 
-`--policy.push_to_hub` publishes what training ends with, when there is no evaluation yet. This adds one afterwards.
+`--policy.push_to_hub` publishes the end of training, when there is no evaluation yet; this command adds one later.
 """
 
 import io
@@ -20,23 +20,26 @@ from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.source import dataset_folder
 from lerobot_wm.hub.errors import check_can_push
 from lerobot_wm.hub.model_card import IMAGINATION, TrainingData, model_card
-from lerobot_wm.inspect.episodes import check_features
-from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, OpenLoop, load_world_model, open_loop
+from lerobot_wm.inspect.episodes import check_features, load_world_model
+from lerobot_wm.inspect.open_loop import CONTEXT, OpenLoop, open_loop, psnr_table
 from lerobot_wm.markdown import escaped
 from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.records import Record, find_records, read_records
-from lerobot_wm.tables import Cell, ReportTable, markdown_table, table_by_split
+from lerobot_wm.tables import ReportTable, markdown_table, table_by_split
 
-SCALE = 2  # pixels of the animation per pixel of an image
+# Pixels of the animation per pixel of an image.
+SCALE = 2
 FRAME_MS = 80
-PAUSE_MS = 1000  # on the last frame, before it begins again
+# On the last frame, before the animation starts again.
+PAUSE_MS = 1000
+# Of a checkpoint's folder, as LeRobot uploads them.
+UPLOADED = ("*.safetensors", "*.json", "*.yaml")
 
 
 def animation(results: list[OpenLoop]) -> bytes:
-    """A WebP file that loops, a column per task. A white line between the two appears when the model imagines.
+    """A WebP file that loops, with a column per task: truth above, and below it what the model saw and then imagines.
 
-    Args:
-        results: one per task.
+    A white line between the two appears when the model imagines.
     """
     columns = [_column(result) for result in results]
     frames = np.concatenate(columns, axis=2).repeat(SCALE, axis=1).repeat(SCALE, axis=2)  # (T, H, W, 3)
@@ -49,23 +52,6 @@ def animation(results: list[OpenLoop]) -> bytes:
     return buffer.getvalue()
 
 
-def psnr_table(results: list[OpenLoop]) -> ReportTable:
-    """Tasks down, steps ahead of the last frame seen across."""
-    rows: list[tuple[str, list[Cell]]] = [
-        (
-            result.task,
-            [f"{ours:.1f} ({copy:.1f})" for ours, copy in zip(result.psnr, result.copy_psnr, strict=True)],
-        )
-        for result in results
-    ]
-    episodes = max(result.n_episodes for result in results)
-    note = (
-        f"PSNR in dB of images imagined from {CONTEXT} frames and the actions that followed, over the last episodes of "
-        f"each task (up to {episodes}); in brackets: of repeating the last frame seen."
-    )
-    return ReportTable("Open-loop prediction", "task", [f"+{step}" for step in HORIZONS], rows, notes=[note])
-
-
 def _column(result: OpenLoop) -> np.ndarray:
     """Frames of one task, (T, 2H + 1, W, 3) uint8: truth, a line, what the model saw and then imagines."""
     below = np.concatenate([result.truth[:CONTEXT], result.imagined])  # (T, C, H, W)
@@ -73,9 +59,6 @@ def _column(result: OpenLoop) -> np.ndarray:
     line[CONTEXT:] = 1
     stacked = np.concatenate([result.truth, line, below], axis=2)
     return (255 * stacked.clip(0, 1)).round().astype(np.uint8).transpose(0, 2, 3, 1)
-
-
-UPLOADED = ("*.safetensors", "*.json", "*.yaml")  # of a checkpoint's folder, as LeRobot uploads them
 
 
 @dataclass
@@ -95,11 +78,11 @@ class PublishConfig:
 
     Args:
         policy: The checkpoint.
-        repo_id: Where to, as user/name; what is there already and has not changed is not sent again.
-        records: Records of `lerobot-wm eval` of this checkpoint, for the card's table; None for none.
-        dataset: An image dataset of which the card shows an episode of each task, and what the world model imagines of
-            it; None for no animation.
-        private: Make the repository private where it is new.
+        repo_id: The repository, as user/name; files that are there already and have not changed are not sent again.
+        records: Records of `lerobot-wm eval` of this checkpoint, for the card's table; None for no table.
+        dataset: An image dataset; the card shows an episode of each task and how the world model imagines it. None for
+            no animation.
+        private: Make a new repository private.
     """
 
     policy: CheckpointFolder
@@ -113,18 +96,18 @@ def publish(cfg: PublishConfig) -> str:
     """Upload a checkpoint and its card.
 
     Returns:
-        Address of the commit.
+        The commit's URL.
 
     Raises:
-        FileNotFoundError: The folder is no checkpoint, or there are no records.
-        ValueError: The records are not of this policy, there is no world model that could imagine, or the dataset lacks
-            what it reads.
+        FileNotFoundError: The folder is not a checkpoint, or there are no records.
+        ValueError: The records are of another policy, the checkpoint holds no world model, or the dataset lacks what it
+            reads.
     """
     folder = cfg.policy.path
     if not (folder / TRAIN_CONFIG_NAME).is_file():
         raise FileNotFoundError(
-            f"{folder} is no checkpoint of a training run: it holds no {TRAIN_CONFIG_NAME}. "
-            "Give --policy.path=<output_dir>/checkpoints/last/pretrained_model."
+            f"{folder} holds no {TRAIN_CONFIG_NAME}, so it is not a checkpoint of a training run. Give "
+            "--policy.path=<output_dir>/checkpoints/last/pretrained_model."
         )
     config = PreTrainedConfig.from_pretrained(folder)
     run = TrainPipelineConfig.from_pretrained(folder)
@@ -164,33 +147,28 @@ def publish(cfg: PublishConfig) -> str:
 
 
 def check_records(records: list[Record], policy_type: str, seed: int | None) -> None:
-    """Refuse records of another policy than the one published.
+    """Check that all records are of the policy that is published.
 
     Raises:
         ValueError: They are of several arms, of another type, or of another training seed.
     """
-    arms = sorted({record["arm"] for record in records})
-    if len(arms) > 1:
+    found = {(record["arm"], record["policy_type"], record["seed"]) for record in records}
+    if len(found) > 1 or {(policy_type, seed)} != {(kind, s) for _, kind, s in found}:
+        others = "; ".join(f"arm {arm}, {kind}, training seed {s}" for arm, kind, s in sorted(found, key=str))
         raise ValueError(
-            f"The records are of the arms {', '.join(arms)}; expected those of this checkpoint alone."
-        )
-    found = {(record["policy_type"], record["seed"]) for record in records}
-    if found != {(policy_type, seed)}:
-        others = ", ".join(f"{kind} with training seed {s}" for kind, s in sorted(found, key=str))
-        raise ValueError(
-            f"The records are of {others}; this checkpoint is {policy_type} with training seed {seed}. "
-            "Give the records of its own evaluation."
+            f"The records are of: {others}. This checkpoint is {policy_type} with training seed {seed}: give the "
+            "records of its evaluation, under one --arm."
         )
 
 
 def _section(table: ReportTable) -> str:
-    """A table in Markdown; names in it are escaped."""
+    """A table in Markdown, the names in it escaped."""
     rows = [(escaped(label), cells) for label, cells in table.rows]
     return markdown_table(replace(table, title=escaped(table.title), rows=rows))
 
 
 def _training_data(run: TrainPipelineConfig) -> TrainingData | None:
-    """What the run was trained on, where that is still on this machine."""
+    """The dataset that the run was trained on, if it is still on this machine."""
     root = dataset_folder(run.dataset.repo_id, run.dataset.root, run.dataset.revision, whole=True)
     if root is None:
         return None
@@ -198,7 +176,7 @@ def _training_data(run: TrainPipelineConfig) -> TrainingData | None:
 
 
 def _upload(files: dict[str, Path | bytes], repo_id: str, private: bool) -> str:
-    """All files in one commit, so that nobody sees half of them."""
+    """Upload all files in one commit, so that nobody sees half of them."""
     api = HfApi()
     api.create_repo(repo_id, private=private, exist_ok=True)
     operations = [

@@ -1,29 +1,47 @@
 """Dreams: the world model sees an episode's first frames, then imagines the rest under several kinds of action."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from textwrap import fill
 from typing import Any
 
+import numpy as np
 import torch
+from lerobot.utils.io_utils import write_video
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont
+from matplotlib.ticker import MaxNLocator
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, TASK
-from lerobot_wm.inspect.episodes import reward_key, shapes_read
+from lerobot_wm.inspect.episodes import ImaginingPolicy, filter_frames, reward_key, rssm_of, stack_episodes
 from lerobot_wm.inspect.open_loop import psnr
 from lerobot_wm.policies.common.cameras import camera_images
 from lerobot_wm.policies.latent.policy import LatentPolicy
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import RSSMState
 
 TRUE_ACTIONS, ZERO_ACTIONS, OWN_ACTIONS = "true actions", "zero actions", "policy's actions"
+# Colour-blind safe (Okabe and Ito 2008), blue as on the page. Dashes leave equal curves visible.
+STYLES = {TRUE_ACTIONS: ("#2f6fde", "-"), ZERO_ACTIONS: ("#d55e00", "--"), OWN_ACTIONS: ("#009e73", ":")}
+# Imagined steps in a strip, at most.
+STEPS_SHOWN = 8
+# Players blur small images: a video's are enlarged by a whole factor up to this width in pixels.
+PANEL_WIDTH = 256
+# Episodes of a second or two would be over before anything is seen.
+MAX_VIDEO_FPS = 15
+_LINE, _GAP = 28, 8
 
 
 @dataclass(frozen=True)
 class Dream:
-    """What the world model makes of T frames: it reconstructs those it sees and imagines the others.
+    """T frames decoded from latents: those of the filter where the model sees, imagined ones after that.
 
-    `images` (T, K·C, 64, 64) are in [0, 1]. `reward` (T,) is the predicted reward that arrives with each frame, which
-    for the first is none and means nothing; None without a reward head.
+    Attributes:
+        images: (T, K·C, 64, 64) in [0, 1].
+        reward: The predicted reward that arrives with each frame, (T,); the first frame's has no meaning. None without
+            a reward head.
     """
 
     images: Tensor
@@ -32,10 +50,15 @@ class Dream:
 
 @dataclass(frozen=True)
 class Dreams:
-    """An episode's first T frames, of which `context` are seen, and dreams of them by kind of action, on the CPU.
+    """Dreams of an episode's first T frames, on the CPU.
 
-    `truth` (T, K·C, 64, 64) holds the images of K cameras as the world model is shown them. `reward` (T,) is what
-    arrived at frame t + 1, of the column `reward_key`; None where the dataset does not have it.
+    Attributes:
+        context: How many of the frames the model sees.
+        n_cameras: K.
+        truth: The images as the world model is shown them, (T, K·C, 64, 64).
+        reward: The dataset's reward that arrives with frame t + 1, (T,); None where it has no such column.
+        reward_key: That column's name.
+        by_actions: The dream under each kind of action.
     """
 
     context: int
@@ -43,14 +66,19 @@ class Dreams:
     truth: Tensor
     reward: Tensor | None
     reward_key: str
-    dreams: dict[str, Dream]
+    by_actions: dict[str, Dream]
+
+    @property
+    def n_imagined(self) -> int:
+        """How many frames are imagined."""
+        return len(self.truth) - self.context
 
     def psnr(self) -> float:
-        """PSNR in dB of the imagined images under true actions, over all steps together."""
-        return self._psnr(self.dreams[TRUE_ACTIONS].images[self.context :])
+        """PSNR in dB of the images imagined under true actions, over all steps together."""
+        return self._psnr(self.by_actions[TRUE_ACTIONS].images[self.context :])
 
     def copy_psnr(self) -> float:
-        """The same of a copy of the last frame seen."""
+        """PSNR in dB of repeating the last frame seen."""
         return self._psnr(self.truth[self.context - 1])
 
     def _psnr(self, images: Tensor) -> float:
@@ -58,59 +86,54 @@ class Dreams:
 
 
 @torch.no_grad()
-def dream(policy: WMRSSMPolicy | LatentPolicy, episode: dict[str, Any], context: int) -> Dreams:
+def dream(policy: ImaginingPolicy, episode: dict[str, Any], context: int) -> Dreams:
     """Filter the first frames of an episode and imagine the others, always taking the mean of z_t.
 
-    The kinds of action: those of the episode; zero in the environment's units, where nothing is commanded; and, for a
-    policy, those it chooses from each imagined latent. While it acts in its dream its proprioception (and full state,
-    where it reads that) is held at the last frame seen: the world model does not predict it, and what the dataset holds
-    would tell the policy where the demonstration went.
+    The kinds of action are those of the episode, zero in the environment's units (no command), and, for a policy, the
+    actions it chooses from each imagined latent. The policy's proprioception, and full state if it reads that, stay as
+    they were at the last frame seen: the world model does not predict them, and the dataset's own would tell the policy
+    where the demonstration went.
 
     Args:
         policy: Holds the world model.
-        episode: Its first T frames: each camera (T, C, H, W) in [0, 1], `action` (T, A), what else
-            `shapes_read` names (T, ·), `task`, and the model's reward (T,) where there is one; as of `read_episodes`.
+        episode: Its first T frames, as `read_episodes` yields them.
         context: How many of them the model sees.
 
     Raises:
         ValueError: The policy does not know the task.
     """
-    config, world_model, key = policy.config, policy.world_model, reward_key(policy)
-    assert isinstance(world_model, WorldModel)  # as load_world_model checked
-    batch = {name: episode[name][None].to(config.device) for name in shapes_read(policy)}  # (1, T, ·) each
-    images, actions = camera_images(config, batch), batch[ACTION]  # (1, T, K·C, 64, 64), (1, T, A)
-    proprio = batch[OBS_STATE][:, :context] if world_model.config.use_proprio else None
-    seen = world_model.filter(images[:, :context], actions[:, :context], proprio)
-    # The first imagined step is reached by the action executed at the last frame seen.
-    true_actions = actions[:, context - 1 : -1]  # (1, T - context, A)
-    imagined = {
+    world_model, key = rssm_of(policy), reward_key(policy)
+    batch = stack_episodes(policy, [episode])
+    seen = filter_frames(policy, batch, context)
+    # The action executed at the last frame seen leads to the first imagined one.
+    true_actions = batch[ACTION][:, context - 1 : -1]  # (1, T - context, A)
+    latents = {
         TRUE_ACTIONS: world_model.imagine(seen.last(), true_actions).latent,
         ZERO_ACTIONS: world_model.imagine(seen.last(), torch.zeros_like(true_actions)).latent,
     }
     if isinstance(policy, LatentPolicy):
         last = {key: value[:, context - 1] for key, value in batch.items()} | {TASK: [episode[TASK]]}
-        imagined[OWN_ACTIONS] = _act(policy, world_model, seen.last(), last, true_actions.shape[1])
+        latents[OWN_ACTIONS] = _act(policy, seen.last(), last, true_actions.shape[1])
 
-    def told(latents: Tensor) -> Dream:
-        """Decode imagined latents (1, T - context, L) together with those of the frames seen."""
-        latents = torch.cat([seen.latent, latents], dim=1)  # (1, T, L)
-        reward = world_model.predict_reward(latents)[0].cpu() if world_model.config.predict_reward else None
-        return Dream(world_model.decode(latents)[0].cpu(), reward)
+    def decode(imagined: Tensor) -> Dream:
+        whole = torch.cat([seen.latent, imagined], dim=1)  # (1, T, L)
+        reward = world_model.predict_reward(whole)[0].cpu() if world_model.config.predict_reward else None
+        return Dream(world_model.decode(whole)[0].cpu(), reward)
 
     return Dreams(
         context=context,
-        n_cameras=len(config.cameras),
-        truth=images[0].cpu(),
-        reward=episode[key].float() if key in episode else None,  # next.success is stored as bool
+        n_cameras=len(policy.config.cameras),
+        truth=camera_images(policy.config, batch)[0].cpu(),
+        # next.success is stored as bool.
+        reward=episode[key].float() if key in episode else None,
         reward_key=key,
-        dreams={name: told(latents) for name, latents in imagined.items()},
+        by_actions={name: decode(imagined) for name, imagined in latents.items()},
     )
 
 
-def _act(
-    policy: LatentPolicy, world_model: WorldModel, state: RSSMState, last: dict[str, Any], n_steps: int
-) -> Tensor:
+def _act(policy: LatentPolicy, state: RSSMState, last: dict[str, Any], n_steps: int) -> Tensor:
     """Latents (1, n_steps, L) that the policy's actions lead to from s_t (1, ·), given the rest of frame t."""
+    world_model = rssm_of(policy)
     tasks = policy.one_hot_tasks(last, 1)  # (1, N)
     env_state = last[OBS_ENV_STATE] if policy.config.use_environment_state else None
     latents = []
@@ -119,3 +142,95 @@ def _act(
         state = world_model.imagine(state, action[:, None]).last()
         latents.append(state.latent)
     return torch.stack(latents, dim=1)
+
+
+def strip_figure(dreams: Dreams) -> Figure:
+    """Truth and dreams as rows and steps as columns; beneath them the reward as curves, where there is a reward head.
+
+    The first column is the last frame seen, which the world model reconstructs.
+    """
+    steps = np.unique(
+        np.linspace(0, dreams.n_imagined, min(dreams.n_imagined, STEPS_SHOWN) + 1).round().astype(int)
+    )
+    rows = _images_by_row(dreams)
+    has_reward = dreams.by_actions[TRUE_ACTIONS].reward is not None
+    _, height, width, _ = rows["truth"].shape
+    # In inches.
+    cell_width, cell_height = 1.25, 1.25 * height / width
+    figure = Figure(
+        figsize=(cell_width * len(steps) + 1.2, cell_height * len(rows) + 0.4 + 2.1 * has_reward),
+        layout="constrained",
+    )
+    grid = figure.add_gridspec(
+        len(rows) + has_reward, len(steps), height_ratios=[cell_height] * len(rows) + [1.8] * has_reward
+    )
+    for row, (name, images) in enumerate(rows.items()):
+        for column, step in enumerate(steps):
+            axes = figure.add_subplot(grid[row, column])
+            axes.imshow(images[dreams.context - 1 + step], interpolation="nearest")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if row == 0:
+                axes.set_title(f"+{step}" if step else "last seen", fontsize=9)
+            if column == 0:
+                axes.set_ylabel(fill(name, 10), fontsize=9, rotation=0, ha="right", va="center")
+    if has_reward:
+        _draw_rewards(figure.add_subplot(grid[-1, :]), dreams)
+        figure.legend(loc="outside lower center", ncols=5, fontsize=8)
+    return figure
+
+
+def _draw_rewards(axes: Axes, dreams: Dreams) -> None:
+    """Draw the reward against the frame it arrives with; none arrives with the first frame."""
+    steps = np.arange(1, len(dreams.truth))
+    if dreams.reward is not None:
+        label = f"truth ({dreams.reward_key})"
+        axes.plot(steps, dreams.reward[:-1], color="black", linewidth=1.2, label=label)
+    for name, imagined in dreams.by_actions.items():
+        assert imagined.reward is not None
+        colour, style = STYLES[name]
+        axes.plot(steps, imagined.reward[1:], style, color=colour, linewidth=1.5, label=name)
+    axes.axvline(dreams.context - 1, color="#7a7a7a", linewidth=0.8, label="last seen")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("step of the episode", fontsize=8)
+    axes.set_ylabel("reward", fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.3)
+
+
+def write_dream(path: Path, dreams: Dreams, fps: int) -> None:
+    """Write the video of dreams of a dataset recorded at `fps` frames per second."""
+    write_video(path, video_frames(dreams), min(fps, MAX_VIDEO_FPS))
+
+
+def video_frames(dreams: Dreams) -> list[np.ndarray]:
+    """Truth and dreams side by side under their names: T frames (H, W, 3) uint8 of even size."""
+    rows = _images_by_row(dreams)
+    n_frames, height, width, _ = rows["truth"].shape
+    factor = max(1, PANEL_WIDTH // width)
+    size = (factor * width, factor * height)
+    canvas_size = ((size[0] + _GAP) * len(rows) + _GAP, size[1] + 2 * _LINE)
+    font = ImageFont.truetype(findfont("DejaVu Sans"), 15)
+    frames = []
+    for t in range(n_frames):
+        canvas = Image.new("RGB", canvas_size, "white")
+        draw = ImageDraw.Draw(canvas)
+        for i, (name, images) in enumerate(rows.items()):
+            left = _GAP + i * (size[0] + _GAP)
+            draw.text((left + size[0] // 2, _LINE // 2), name, fill="black", font=font, anchor="mm")
+            canvas.paste(Image.fromarray(images[t]).resize(size, Image.Resampling.NEAREST), (left, _LINE))
+        ahead = t - dreams.context + 1
+        text = f"step {t}: imagined, +{ahead}" if ahead > 0 else f"step {t}: seen"
+        draw.text((_GAP, canvas_size[1] - _LINE // 2), text, fill="black", font=font, anchor="lm")
+        frames.append(np.asarray(canvas))
+    return frames
+
+
+def _images_by_row(dreams: Dreams) -> dict[str, np.ndarray]:
+    """Truth and dreams by name, each (T, K·H, W, C) uint8: the K cameras one above the other."""
+    images = {"truth": dreams.truth} | {name: dream.images for name, dream in dreams.by_actions.items()}
+    stacked = {
+        name: of_row.unflatten(1, (dreams.n_cameras, -1)).permute(0, 1, 3, 4, 2).flatten(1, 2)
+        for name, of_row in images.items()
+    }
+    return {name: (255 * of_row).round().byte().numpy() for name, of_row in stacked.items()}

@@ -2,20 +2,23 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import draccus
 from lerobot.configs.default import WandBConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.evaluate.wandb_log import log_dream, wandb_run
-from lerobot_wm.inspect.dream import Dreams, dream
-from lerobot_wm.inspect.dream_figures import strip_figure, write_dream
-from lerobot_wm.inspect.episodes import check_features, read_episodes
-from lerobot_wm.inspect.html import PNG, figure_bytes
-from lerobot_wm.inspect.open_loop import load_world_model
+from lerobot_wm.evaluate.wandb_log import wandb_run
+from lerobot_wm.inspect.dream import Dreams, dream, strip_figure, write_dream
+from lerobot_wm.inspect.episodes import check_features, load_world_model, read_episodes
+from lerobot_wm.inspect.open_loop import CONTEXT
+from lerobot_wm.inspect.pictures import PNG, figure_bytes
 from lerobot_wm.policies.common.checkpoint import split_revision
 from lerobot_wm.quiet import quiet, silence
+
+if TYPE_CHECKING:  # wandb takes seconds to import
+    import wandb
 
 
 @dataclass
@@ -30,72 +33,86 @@ class DreamConfig:
     """Flags of `lerobot-wm dream`.
 
     Args:
-        policy: Folder or Hub id, with @revision or not, of a wm_rssm, wm_bc or wm_iql checkpoint.
+        policy: Folder or Hub id (with @revision or without) of a wm_rssm, wm_bc or wm_iql checkpoint.
         dataset: The image dataset.
-        episode: Which of its episodes.
-        context: Frames at its beginning that the world model sees.
-        horizon: Steps to imagine; None goes on to the end of the episode.
-        output_dir: Where episode_N.mp4 and episode_N.png go.
+        episode: Index of the episode.
+        context: How many of its first frames the world model sees.
+        horizon: How many steps it imagines; None imagines the rest of the episode.
+        output_dir: Where episode_N.mp4 and episode_N.png are written.
         wandb: `--wandb.enable=true` logs the dream to the run that trained the checkpoint.
     """
 
     policy: CheckpointConfig
     dataset: SourceConfig
     episode: int
-    context: int = 5
+    context: int = CONTEXT
     horizon: int | None = None
     output_dir: Path = Path("outputs/dream")
     wandb: WandBConfig = field(default_factory=WandBConfig)
+
+    @property
+    def video(self) -> Path:
+        """The video to write."""
+        return self.output_dir / f"episode_{self.episode}.mp4"
+
+    @property
+    def strip(self) -> Path:
+        """The strip of pictures to write."""
+        return self.video.with_suffix(".png")
 
 
 def dream_of(cfg: DreamConfig) -> Dreams:
     """Dream of an episode and write its video and strip.
 
     Raises:
-        ValueError: The checkpoint holds no world model, the dataset lacks what the policy reads or has it in another
-            size, or there is no such episode, or it is too short.
+        ValueError: The checkpoint holds no world model, it cannot read the dataset, or the episode does not exist or is
+            too short.
     """
     policy = load_world_model(cfg.policy.path)
     with quiet():
         meta = cfg.dataset.metadata()
         check_features(policy, meta)
-        [episode] = read_episodes(policy, meta, cfg.dataset, [cfg.episode], _frames_read(cfg, meta))
+        [episode] = read_episodes(policy, meta, cfg.dataset, [cfg.episode], _count_frames(cfg, meta))
     dreams = dream(policy, episode, cfg.context)
-    video, strip = outputs(cfg)
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
-    write_dream(video, dreams, meta.fps)
-    strip.write_bytes(figure_bytes(strip_figure(dreams), PNG))
-    name, checkpoint_revision = split_revision(cfg.policy.path)
-    with wandb_run(cfg.wandb, Path(name), cfg.output_dir, checkpoint_revision) as run:
+    write_dream(cfg.video, dreams, meta.fps)
+    cfg.strip.write_bytes(figure_bytes(strip_figure(dreams), PNG))
+    name, revision = split_revision(cfg.policy.path)
+    with wandb_run(cfg.wandb, Path(name), cfg.output_dir, revision) as run:
         if run is not None:
-            log_dream(run, dreams, video, strip)
+            _log(run, dreams, cfg)
     return dreams
 
 
-def outputs(cfg: DreamConfig) -> tuple[Path, Path]:
-    """The video and the strip to write."""
-    return cfg.output_dir / f"episode_{cfg.episode}.mp4", cfg.output_dir / f"episode_{cfg.episode}.png"
-
-
-def _frames_read(cfg: DreamConfig, meta: LeRobotDatasetMetadata) -> int:
+def _count_frames(cfg: DreamConfig, meta: LeRobotDatasetMetadata) -> int:
     """How many frames of the episode are seen and imagined."""
     if not 0 <= cfg.episode < meta.total_episodes:
         raise ValueError(
-            f"--episode={cfg.episode}, but {meta.repo_id} has {meta.total_episodes} episodes: give one of "
-            f"0 to {meta.total_episodes - 1}."
-        )
-    if cfg.context < 1 or (cfg.horizon is not None and cfg.horizon < 1):
-        raise ValueError(
-            f"--context={cfg.context}, --horizon={cfg.horizon}: see at least 1 frame and imagine at least 1 step."
+            f"--episode={cfg.episode}: {meta.repo_id} has {meta.total_episodes} episodes. Give one of 0 to "
+            f"{meta.total_episodes - 1}."
         )
     length = meta.episodes[cfg.episode]["length"]
     n_frames = length if cfg.horizon is None else cfg.context + cfg.horizon
-    if not cfg.context < n_frames <= length:
+    if not 1 <= cfg.context < n_frames <= length:
         raise ValueError(
-            f"Episode {cfg.episode} has {length} frames; to see {cfg.context} and imagine {cfg.horizon or 'the rest'} "
-            f"takes at least {max(n_frames, cfg.context + 1)}: lower --context or --horizon, or choose a longer one."
+            f"--context={cfg.context}, --horizon={cfg.horizon}: episode {cfg.episode} has {length} frames, of which at "
+            "least 1 must be seen and 1 imagined. Choose other values or a longer episode."
         )
     return n_frames
+
+
+def _log(run: "wandb.Run", dreams: Dreams, cfg: DreamConfig) -> None:
+    """Log the video, the strip, and the PSNR in dB of the imagined frames and of a repeated frame."""
+    import wandb
+
+    run.log(
+        {
+            "dream/video": wandb.Video(str(cfg.video), format="mp4"),
+            "dream/strip": wandb.Image(str(cfg.strip)),
+            "dream/psnr": dreams.psnr(),
+            "dream/copy_psnr": dreams.copy_psnr(),
+        }
+    )
 
 
 def main() -> None:
@@ -103,8 +120,7 @@ def main() -> None:
     silence()
     cfg = draccus.parse(DreamConfig)
     dreams = dream_of(cfg)
-    video, strip = outputs(cfg)
     print(
-        f"{len(dreams.truth) - cfg.context} steps: PSNR {dreams.psnr():.1f} dB under true actions, "
-        f"{dreams.copy_psnr():.1f} dB for the last frame copied -> {video}, {strip}"
+        f"{dreams.n_imagined} steps: PSNR {dreams.psnr():.1f} dB under true actions, {dreams.copy_psnr():.1f} dB for "
+        f"repeating the last frame -> {cfg.video}, {cfg.strip}"
     )

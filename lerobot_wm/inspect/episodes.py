@@ -1,4 +1,4 @@
-"""Episodes of an image dataset as a world model is shown them: what it reads, and reading it."""
+"""World models that imagine images, and the episodes of image datasets that they are shown."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -8,40 +8,68 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, TASK
+from lerobot_wm.constants import ACTION, OBS_STATE, TASK
 from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.nn.images import resize_images
+from lerobot_wm.policies.common.cameras import camera_images
+from lerobot_wm.policies.latent.encoder import load_encoder
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
+from lerobot_wm.world_model.model import WorldModel
+from lerobot_wm.world_model.rssm import RSSMState
 
-_FRAMES_AT_ONCE = 64  # read and then made small: bounds memory for long episodes of large images
+# Frames that are read before they are resized: bounds memory for long episodes of large images.
+_FRAMES_AT_ONCE = 64
+
+type ImaginingPolicy = WMRSSMPolicy | LatentPolicy
 
 
-def shapes_read(policy: WMRSSMPolicy | LatentPolicy) -> dict[str, tuple[int, ...]]:
-    """Keys that the model and a policy on it read from a dataset, with their shapes in training (cameras: C, H, W)."""
+def load_world_model(path: str) -> ImaginingPolicy:
+    """Load a checkpoint that holds an RSSM: wm_rssm, or a policy on its latents. See `load_encoder`.
+
+    Raises:
+        ValueError: The checkpoint holds none.
+    """
+    policy = load_encoder(path)
+    if not isinstance(policy, WMRSSMPolicy | LatentPolicy) or not isinstance(policy.world_model, WorldModel):
+        raise ValueError(
+            f"{path} ({policy.config.type}) holds no world model that imagines images. Give a wm_rssm checkpoint, or a "
+            "policy on its latents."
+        )
+    return policy.eval()
+
+
+def rssm_of(policy: ImaginingPolicy) -> WorldModel:
+    """The policy's world model, which is an RSSM: `load_world_model` accepts no other."""
+    assert isinstance(policy.world_model, WorldModel)
+    return policy.world_model
+
+
+def world_model_config(policy: ImaginingPolicy) -> WMRSSMConfig:
+    """The configuration that the policy's world model was trained with."""
+    config = policy.config if isinstance(policy, WMRSSMPolicy) else policy.config.world_model
+    assert isinstance(config, WMRSSMConfig)
+    return config
+
+
+def reward_key(policy: ImaginingPolicy) -> str:
+    """The column that the world model's reward head learned; the policy's own `reward_key` may differ."""
+    return world_model_config(policy).reward_key
+
+
+def shapes_read(policy: ImaginingPolicy) -> dict[str, tuple[int, ...]]:
+    """What the world model and the policy read from a dataset: key -> shape in training (cameras: C, H, W)."""
     config = policy.config
     shapes = {key: tuple(config.input_features[key].shape) for key in config.features_read}
     return shapes | {ACTION: tuple(config.output_features[ACTION].shape)}
 
 
-def reward_key(policy: WMRSSMPolicy | LatentPolicy) -> str:
-    """The column that the world model's reward head learned; wm_iql's own `reward_key` may be another."""
-    return world_model_config(policy).reward_key
-
-
-def world_model_config(policy: WMRSSMPolicy | LatentPolicy) -> WMRSSMConfig:
-    """The configuration that the world model, a policy's own or the one it is on, was trained with."""
-    config = policy.config if isinstance(policy, WMRSSMPolicy) else policy.config.world_model
-    assert isinstance(config, WMRSSMConfig)  # `load_world_model` refuses others
-    return config
-
-
-def check_features(policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset without what the model and a policy on it read; images of any size are resized.
+def check_features(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata) -> None:
+    """Check that a dataset has what the policy reads, in the size it was trained on; images may have any size.
 
     Raises:
-        ValueError: It lacks a feature, or has it in another size.
+        ValueError: A feature is missing or has another size.
     """
     shapes = shapes_read(policy)
     missing = [key for key in shapes if key not in meta.features]
@@ -54,8 +82,8 @@ def check_features(policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMeta
         found = tuple(meta.features[key]["shape"])
         if found != shapes[key]:
             raise ValueError(
-                f"'{key}' of {meta.repo_id} is {found}, the checkpoint was trained on {shapes[key]}: "
-                "use the kind of dataset it was trained on."
+                f"'{key}' has shape {found} in {meta.repo_id}, but the checkpoint was trained on {shapes[key]}. Give a "
+                "dataset like the one it was trained on."
             )
 
 
@@ -70,28 +98,28 @@ def episodes_by_task(meta: LeRobotDatasetMetadata, min_length: int = 1) -> dict[
 
 
 def read_episodes(
-    policy: WMRSSMPolicy | LatentPolicy,
+    policy: ImaginingPolicy,
     meta: LeRobotDatasetMetadata,
     source: SourceConfig,
     episodes: list[int],
     max_frames: int | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Read episodes one after another; no other's images are decoded.
+    """Read episodes one after another; no other episode's images are decoded.
 
     Args:
-        policy: The model, or a policy on it.
-        meta: The dataset's.
-        source: Where it is.
-        episodes: Which, in ascending order.
-        max_frames: How many frames of each, from its first on; None reads it whole.
+        policy: The world model, or a policy on it.
+        meta: The dataset's metadata.
+        source: Where the dataset is.
+        episodes: Indices in ascending order.
+        max_frames: How many frames of each to read, from the first on; None reads all.
 
     Yields:
         What the policy reads of T frames: each camera (T, C, H, W) in [0, 1] at the model's image size, `action` (T, A)
-        and the others of `shapes_read` (T, ·); the model's reward (T,) where the dataset has that column; `task`, the
-        one that `episodes_by_task` counts it under.
+        and the other keys of `shapes_read` (T, ·); the reward that the world model learned (T,) where the dataset has
+        it; `task`, under which `episodes_by_task` counts the episode.
     """
     keys = [*shapes_read(policy), *({reward_key(policy)} & meta.features.keys())]
-    all_lengths = meta.episodes["length"][:]
+    all_lengths, tasks = meta.episodes["length"][:], meta.episodes["tasks"][:]
     lengths = [all_lengths[episode] for episode in episodes]
     times = [step / meta.fps for step in range(min(max(lengths), _FRAMES_AT_ONCE))]
     dataset = LeRobotDataset(
@@ -101,17 +129,36 @@ def read_episodes(
         episodes=episodes,
         delta_timestamps=dict.fromkeys(keys, times),
     )
-    tasks = meta.episodes["tasks"][:]
-    start = 0  # among the frames of these episodes
+    # The episode's first frame among those of `episodes`.
+    start = 0
     for episode, length in zip(episodes, lengths, strict=True):
-        stop = min(length, max_frames or length)
-        parts: dict[str, list[Tensor]] = {key: [] for key in keys}
-        for position in range(0, stop, len(times)):
-            window = dataset[start + position]  # beyond its end an episode's last frame is repeated
+        n_frames = min(length, max_frames or length)
+        chunks: dict[str, list[Tensor]] = {key: [] for key in keys}
+        for position in range(0, n_frames, len(times)):
+            # LeRobot repeats an episode's last frame beyond its end.
+            window = dataset[start + position]
             for key in keys:
-                part = window[key][: stop - position]
+                chunk = window[key][: n_frames - position]
                 if key in policy.config.cameras:
-                    part = resize_images(part, policy.config.image_size)
-                parts[key].append(part)
-        yield {key: torch.cat(of_key) for key, of_key in parts.items()} | {TASK: tasks[episode][0]}
+                    chunk = resize_images(chunk, policy.config.image_size)
+                chunks[key].append(chunk)
+        yield {key: torch.cat(of_key) for key, of_key in chunks.items()} | {TASK: tasks[episode][0]}
         start += length
+
+
+def stack_episodes(policy: ImaginingPolicy, episodes: list[dict[str, Any]]) -> dict[str, Tensor]:
+    """Stack what the policy reads of B episodes of T frames on its device: (B, T, ·) by key."""
+    return {
+        key: torch.stack([episode[key] for episode in episodes]).to(policy.config.device)
+        for key in shapes_read(policy)
+    }
+
+
+def filter_frames(
+    policy: ImaginingPolicy, batch: dict[str, Tensor], n_frames: int | None = None
+) -> RSSMState:
+    """Filter the first `n_frames` of stacked episodes, taking z_t at its posterior mean."""
+    frames = {key: value[:, :n_frames] for key, value in batch.items()}
+    world_model = rssm_of(policy)
+    proprio = frames[OBS_STATE] if world_model.config.use_proprio else None
+    return world_model.filter(camera_images(policy.config, frames), frames[ACTION], proprio)

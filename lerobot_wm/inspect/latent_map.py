@@ -12,28 +12,37 @@ from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 from tqdm import tqdm
 
-from lerobot_wm.constants import ACTION, OBS_STATE, TASK
+from lerobot_wm.constants import TASK
 from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.inspect.episodes import episodes_by_task, read_episodes
-from lerobot_wm.policies.common.cameras import camera_images
-from lerobot_wm.policies.latent.policy import LatentPolicy
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.world_model.model import WorldModel
-
-MAX_EPISODES = 48  # of all tasks together, but at least one of each
-MAX_FRAMES = (
-    500  # of an episode, its first: all of Meta-World's, and a bound to time and memory for longer ones
+from lerobot_wm.inspect.episodes import (
+    ImaginingPolicy,
+    episodes_by_task,
+    filter_frames,
+    read_episodes,
+    stack_episodes,
 )
-FRAMES_PER_EPISODE = 40  # drawn, spread evenly over what is read of it
+
+# Of all tasks together, but at least one of each.
+MAX_EPISODES = 48
+# Of an episode, from its first on: bounds time and memory for longer ones than Meta-World's.
+MAX_FRAMES = 500
+# Drawn, spread evenly over the frames read.
+FRAMES_PER_EPISODE = 40
 
 
 @dataclass(frozen=True)
 class LatentMap:
-    """N latents of an episode sample, in random order; of each episode the first `max_frames` at most.
+    """N latents of some episodes, in random order.
 
-    `points` (N, 2) are their first two principal components and `explained` the share of the variance that each of
-    the two holds. `task` (N,) are positions in `tasks`; `time` (N,) runs from 0, the episode's first frame, to 1, the
-    last that was read.
+    Attributes:
+        tasks: The tasks' names.
+        n_episodes: How many episodes they are from.
+        max_frames: How many frames of each episode were read, at most.
+        n_dims: Size of a latent.
+        points: Their first two principal components, (N, 2).
+        explained: Share of the variance that each of the two explains.
+        task: Each latent's position in `tasks`, (N,).
+        time: From 0 at an episode's first frame to 1 at the last that was read, (N,).
     """
 
     tasks: list[str]
@@ -52,18 +61,14 @@ class LatentMap:
 
 
 @torch.no_grad()
-def latent_map(
-    policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig
-) -> LatentMap:
-    """Filter the last episodes of each task, up to MAX_FRAMES, and project their latents, z_t at its posterior mean.
+def latent_map(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig) -> LatentMap:
+    """Filter the last episodes of each task and project their latents, z_t at its posterior mean.
 
     Args:
         policy: Holds the world model.
         meta: A dataset that it can read, see `check_features`.
-        source: Where it is.
+        source: Where the dataset is.
     """
-    world_model = policy.world_model
-    assert isinstance(world_model, WorldModel)  # as load_world_model checked
     by_task = episodes_by_task(meta)
     per_task = max(1, MAX_EPISODES // len(by_task))
     episodes = sorted(index for of_task in by_task.values() for index in of_task[-per_task:])
@@ -71,9 +76,7 @@ def latent_map(
     latents, task, time = [], [], []
     read = read_episodes(policy, meta, source, episodes, MAX_FRAMES)
     for episode in tqdm(read, total=len(episodes), desc="Mapping", unit="episode"):
-        batch = {key: value[None].to(policy.config.device) for key, value in episode.items() if key != TASK}
-        proprio = batch[OBS_STATE] if world_model.config.use_proprio else None
-        states = world_model.filter(camera_images(policy.config, batch), batch[ACTION], proprio)
+        states = filter_frames(policy, stack_episodes(policy, [episode]))
         of_episode = states.latent[0].cpu().numpy()  # (T, L)
         last = len(of_episode) - 1
         frames = np.unique(np.linspace(0, last, min(last + 1, FRAMES_PER_EPISODE)).round().astype(int))
@@ -83,9 +86,8 @@ def latent_map(
     stacked = np.concatenate(latents)  # (N, L)
     pca = PCA(2, random_state=0)
     points = pca.fit_transform(stacked)
-    order = np.random.default_rng(0).permutation(
-        len(points)
-    )  # or the last task would be drawn over the others
+    # In random order, so that no task covers the others.
+    order = np.random.default_rng(0).permutation(len(points))
     return LatentMap(
         tasks=tasks,
         n_episodes=len(episodes),
@@ -99,14 +101,14 @@ def latent_map(
 
 
 def task_colours(n_tasks: int) -> list[str]:
-    """Colours that are told apart as well as that many can be, as #rrggbb."""
+    """Colours that differ as much as possible, as #rrggbb."""
     if n_tasks <= 10:
         return [to_hex(colormaps["tab10"](i)) for i in range(n_tasks)]
     return [to_hex(colormaps["turbo"](i / (n_tasks - 1))) for i in range(n_tasks)]
 
 
 def latent_figures(latents: LatentMap) -> tuple[Figure, Figure]:
-    """The same points twice: coloured by task, and by time within the episode; the page holds the legends."""
+    """The same points coloured by task, and by time within the episode; the page adds the legends."""
     by_task, axes = _axes(latents)
     x, y = latents.points.T
     colours = np.array(task_colours(len(latents.tasks)))

@@ -1,4 +1,4 @@
-"""Open-loop prediction: the world model sees five frames, then imagines from actions alone."""
+"""Open-loop prediction: the world model sees five frames, then imagines the next ones from actions alone."""
 
 import logging
 import math
@@ -13,30 +13,40 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wm.constants import ACTION, OBS_STATE, TASK
+from lerobot_wm.constants import ACTION, TASK
 from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.inspect.episodes import episodes_by_task, read_episodes, shapes_read
+from lerobot_wm.inspect.episodes import (
+    ImaginingPolicy,
+    episodes_by_task,
+    filter_frames,
+    read_episodes,
+    rssm_of,
+    stack_episodes,
+)
 from lerobot_wm.policies.common.cameras import camera_images, side_by_side
-from lerobot_wm.policies.latent.encoder import load_encoder
-from lerobot_wm.policies.latent.policy import LatentPolicy
-from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.world_model.model import WorldModel
+from lerobot_wm.tables import Measurement, ReportTable
 
 logger = logging.getLogger(__name__)
 
-CONTEXT = 5  # frames the model sees
-HORIZONS = (1, 5, 10, 20, 45)  # frames ahead of the last one it saw
+# Frames that the model sees.
+CONTEXT = 5
+# Steps ahead of the last frame seen.
+HORIZONS = (1, 5, 10, 20, 45)
 WINDOW = CONTEXT + HORIZONS[-1]
 EPISODES_PER_TASK = 4
 
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Predictions on one task's episodes, from their first frames on.
+    """Predictions of one task's episodes, from their first frames on.
 
-    `truth` (CONTEXT + H, C, H, W) and `imagined` (H, C, H, W) are the first episode's images in [0, 1], several
-    cameras side by side. PSNR is in dB by horizon, from the squared error averaged over the pixels of all cameras and
-    over episodes; `copy_psnr` is that of repeating the last frame seen.
+    Attributes:
+        task: The task.
+        n_episodes: How many episodes were predicted.
+        truth: The first episode's images, (CONTEXT + H, C, H, W) in [0, 1], several cameras side by side.
+        imagined: The images imagined after the context, (H, C, H, W).
+        psnr: PSNR in dB at each horizon, from the squared error averaged over pixels, cameras and episodes.
+        copy_psnr: The PSNR of repeating the last frame seen.
     """
 
     task: str
@@ -47,30 +57,13 @@ class OpenLoop:
     copy_psnr: list[float]
 
 
-def load_world_model(path: str) -> WMRSSMPolicy | LatentPolicy:
-    """A checkpoint, see `load_encoder`, that holds an RSSM: wm_rssm, or a policy on its latents.
-
-    Raises:
-        ValueError: the checkpoint holds none.
-    """
-    policy = load_encoder(path)
-    if not isinstance(policy, WMRSSMPolicy | LatentPolicy) or not isinstance(policy.world_model, WorldModel):
-        raise ValueError(
-            f"{path} ({policy.config.type}) holds no world model that imagines images: give a wm_rssm checkpoint, or "
-            "one of a policy on its latents."
-        )
-    return policy.eval()
-
-
-def open_loop(
-    policy: WMRSSMPolicy | LatentPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig
-) -> list[OpenLoop]:
-    """Predict the last episodes of each task (those LeRobot's `eval_split` holds out); none where all are shorter.
+def open_loop(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig) -> list[OpenLoop]:
+    """Predict the last episodes of each task, which LeRobot's `eval_split` holds out; none where all are too short.
 
     Args:
         policy: Holds the world model.
         meta: A dataset that it can read, see `check_features`.
-        source: Where it is.
+        source: Where the dataset is.
     """
     by_task = episodes_by_task(meta, min_length=WINDOW)
     if not by_task:
@@ -87,39 +80,62 @@ def open_loop(
 
 
 @torch.no_grad()
-def predict(policy: WMRSSMPolicy | LatentPolicy, task: str, windows: list[dict[str, Any]]) -> OpenLoop:
-    """Filter the first CONTEXT frames of each window, imagine the rest under its actions.
+def predict(policy: ImaginingPolicy, task: str, windows: list[dict[str, Any]]) -> OpenLoop:
+    """Filter the first CONTEXT frames of each window, then imagine the rest under its actions.
 
     Args:
-        policy: holds the world model.
-        task: what the windows show.
-        windows: each the first WINDOW frames of an episode, as of `read_episodes`.
+        policy: Holds the world model.
+        task: The task of the windows.
+        windows: The first WINDOW frames of episodes, as `read_episodes` yields them.
     """
-    config, world_model = policy.config, policy.world_model
-    assert isinstance(world_model, WorldModel)  # as load_world_model checked
-    batch = {
-        key: torch.stack([window[key] for window in windows]).to(config.device) for key in shapes_read(policy)
-    }
-    images, actions = camera_images(config, batch), batch[ACTION]  # (B, T, C, 64, 64), (B, T, A)
-    proprio = batch[OBS_STATE][:, :CONTEXT] if world_model.config.use_proprio else None
-    context = world_model.filter(images[:, :CONTEXT], actions[:, :CONTEXT], proprio)
-    # The first imagined step is reached by the action executed at the last frame seen.
-    states = world_model.imagine(context.last(), actions[:, CONTEXT - 1 : -1])
+    world_model, n_cameras = rssm_of(policy), len(policy.config.cameras)
+    batch = stack_episodes(policy, windows)
+    images = camera_images(policy.config, batch)  # (B, T, C, 64, 64)
+    context = filter_frames(policy, batch, CONTEXT)
+    # The action executed at the last frame seen leads to the first imagined one.
+    states = world_model.imagine(context.last(), batch[ACTION][:, CONTEXT - 1 : -1])
     imagined = world_model.decode(states.latent)  # (B, T - CONTEXT, C, 64, 64)
     future, last_seen = images[:, CONTEXT:], images[:, CONTEXT - 1 : CONTEXT]
     return OpenLoop(
         task=task,
         n_episodes=len(windows),
-        truth=side_by_side(images[0], len(config.cameras)).cpu().numpy(),
-        imagined=side_by_side(imagined[0], len(config.cameras)).cpu().numpy(),
-        psnr=_psnr(imagined, future),
-        copy_psnr=_psnr(last_seen, future),
+        truth=side_by_side(images[0], n_cameras).cpu().numpy(),
+        imagined=side_by_side(imagined[0], n_cameras).cpu().numpy(),
+        psnr=_psnr_by_horizon(imagined, future),
+        copy_psnr=_psnr_by_horizon(last_seen, future),
     )
 
 
 def psnr(squared_error: float) -> float:
-    """PSNR in dB of a mean squared error of images in [0, 1]; images that are equal are given 100 dB."""
+    """PSNR in dB of a mean squared error of images in [0, 1], at most 100 dB."""
     return -10 * math.log10(max(squared_error, 1e-10))
+
+
+def _psnr_by_horizon(predicted: Tensor, truth: Tensor) -> list[float]:
+    """PSNR in dB at each horizon, images (B, T, C, H, W) in [0, 1]."""
+    error = (predicted - truth).square().mean(dim=(0, 2, 3, 4))[[horizon - 1 for horizon in HORIZONS]]
+    return [psnr(value) for value in error.tolist()]
+
+
+def psnr_table(results: list[OpenLoop]) -> ReportTable:
+    """Tasks down, horizons across."""
+    rows = [
+        (
+            result.task,
+            [
+                Measurement(f"{ours:.1f}", f"{copy:.1f}")
+                for ours, copy in zip(result.psnr, result.copy_psnr, strict=True)
+            ],
+        )
+        for result in results
+    ]
+    episodes = max(result.n_episodes for result in results)
+    note = (
+        f"PSNR in dB (higher is better) of the images imagined after {CONTEXT} frames, at each number of steps ahead, "
+        f"over the last episodes of each task (at most {episodes}). In brackets or small print: PSNR of repeating the "
+        "last frame seen."
+    )
+    return ReportTable("Open-loop prediction", "task", [f"+{step}" for step in HORIZONS], rows, notes=[note])
 
 
 def strips_figure(results: list[OpenLoop]) -> Figure:
@@ -130,25 +146,15 @@ def strips_figure(results: list[OpenLoop]) -> Figure:
     axes = figure.subplots(2 * len(results), len(HORIZONS) + 1, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
+    steps = (0, *HORIZONS)
     for result, (above, below) in zip(results, axes.reshape(len(results), 2, -1), strict=True):
-        above[0].imshow(_pixels(result.truth[CONTEXT - 1]))
-        above[0].set_title("last seen", fontsize=8)
+        for axis, step in zip(above, steps, strict=True):
+            axis.imshow(np.moveaxis(result.truth[CONTEXT - 1 + step], 0, -1))
+            axis.set_title(f"+{step}" if step else "last seen", fontsize=8)
+        for axis, step in zip(below[1:], HORIZONS, strict=True):
+            axis.imshow(np.moveaxis(result.imagined[step - 1], 0, -1))
         transform = below[0].transAxes
         name = below[0].text(0, 0.5, fill(result.task, 14), fontsize=8, transform=transform, va="center")
-        name.set_in_layout(False)  # or it would widen its column
-        for column, horizon in enumerate(HORIZONS, start=1):
-            above[column].imshow(_pixels(result.truth[CONTEXT - 1 + horizon]))
-            above[column].set_title(f"+{horizon}", fontsize=8)
-            below[column].imshow(_pixels(result.imagined[horizon - 1]))
+        # Without this a long name would widen its column.
+        name.set_in_layout(False)
     return figure
-
-
-def _psnr(predicted: Tensor, truth: Tensor) -> list[float]:
-    """PSNR in dB at each horizon, images (B, T, C, H, W) in [0, 1]."""
-    error = (predicted - truth).square().mean(dim=(0, 2, 3, 4))[[horizon - 1 for horizon in HORIZONS]]
-    return [psnr(value) for value in error.tolist()]
-
-
-def _pixels(image: np.ndarray) -> np.ndarray:
-    """(C, H, W) -> (H, W, C)."""
-    return image.transpose(1, 2, 0)

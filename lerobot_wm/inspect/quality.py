@@ -1,4 +1,4 @@
-"""`lerobot-wm quality`: how good a world model is, on positions it was never trained on."""
+"""`lerobot-wm quality`: how good a world model is, on positions that it was never trained on."""
 
 import json
 import logging
@@ -10,17 +10,19 @@ import torch
 
 from lerobot_wm.constants import QUALITY_NAME
 from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.inspect.episodes import episodes_by_task, world_model_config
-from lerobot_wm.inspect.html import PNG, SVG, figure_bytes
-from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, WINDOW, load_world_model
-from lerobot_wm.inspect.quality_dynamics import drift, kl_quality, reward_quality
-from lerobot_wm.inspect.quality_episodes import Episode, filter_episodes, read_episodes, start_positions
+from lerobot_wm.inspect.episodes import episodes_by_task, load_world_model, rssm_of, world_model_config
+from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, WINDOW
+from lerobot_wm.inspect.pictures import PNG, SVG, figure_bytes
+from lerobot_wm.inspect.quality_episodes import Episode, filter_episodes, read_demonstrations, start_positions
 from lerobot_wm.inspect.quality_figures import EXAMPLES_NAME, examples_figure, quality_figures
-from lerobot_wm.inspect.quality_open_loop import (
+from lerobot_wm.inspect.quality_measures import (
     FOREGROUND_THRESHOLD,
+    drift,
     image_errors,
+    kl_quality,
     mean_and_median_image,
     predictions,
+    reward_quality,
     summarise,
 )
 from lerobot_wm.inspect.quality_probes import FRAMES_PER_EPISODE, draw_frames, probe_positions, probe_task
@@ -30,7 +32,7 @@ from lerobot_wm.world_model.model import WorldModel
 
 logger = logging.getLogger(__name__)
 
-# Training episodes of each task that probes are fitted on, spread over the training data's variations.
+# Training episodes of each task that probes are fitted to, spread over the training data's variations.
 PROBE_EPISODES_PER_TASK = 40
 
 
@@ -40,10 +42,10 @@ class QualityConfig:
 
     Args:
         world_model_path: Folder or Hub id of a wm_rssm, wm_bc or wm_iql checkpoint.
-        dataset: Episodes of `lerobot-wm collect` to judge it on, of variations it was not trained on.
-        output_dir: Where quality.json and the figures go.
-        train_dataset: What it was trained on; probes are fitted on its episodes of the tasks of `dataset`, and it
-            has each of them. Without it they are fitted and tested on `dataset` by cross-validation over variations.
+        dataset: Episodes of `lerobot-wm collect` to judge it on, of variations that it was not trained on.
+        output_dir: Where quality.json and the figures are written.
+        train_dataset: What it was trained on: probes are fitted to its episodes of the tasks of `dataset`, all of which
+            it must have. Without it, probes are fitted and tested on `dataset` by cross-validation over variations.
         seed: Seed of every random choice.
         episodes_per_task: Episodes of each task of `dataset`, spread over its variations.
     """
@@ -66,8 +68,7 @@ def quality(cfg: QualityConfig) -> Path:
         ValueError: The checkpoint holds no world model, or a dataset cannot be judged on.
     """
     policy = load_world_model(cfg.world_model_path)
-    world_model, cameras = policy.world_model, policy.config.cameras
-    assert isinstance(world_model, WorldModel)  # as load_world_model checked
+    world_model, cameras = rssm_of(policy), policy.config.cameras
     training, episodes = _read_datasets(cfg, cameras)
     n_seen = _count_seen(training, episodes)
     window_length = world_model_config(policy).window_length
@@ -82,7 +83,7 @@ def quality(cfg: QualityConfig) -> Path:
     stacked = predictions(
         world_model, [episodes[i] for i in long], [filtered[i] for i in long], mean_image, cfg.seed
     )
-    # Side by side, each camera has a foreground of its own.
+    # Side by side, each camera has its own foreground.
     images = {name: side_by_side(of_name, len(cameras)) for name, of_name in stacked.items()}
     median_image = side_by_side(median_image, len(cameras))
 
@@ -117,67 +118,55 @@ def quality(cfg: QualityConfig) -> Path:
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     for name, figure in quality_figures(result).items():
         (cfg.output_dir / f"quality_{name}.svg").write_bytes(figure_bytes(figure, SVG))
-    (cfg.output_dir / EXAMPLES_NAME).write_bytes(figure_bytes(examples_figure(images, tasks, HORIZONS), PNG))
+    (cfg.output_dir / EXAMPLES_NAME).write_bytes(figure_bytes(examples_figure(images, tasks), PNG))
     path = cfg.output_dir / QUALITY_NAME
     path.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
     return path
 
 
 def _read_datasets(cfg: QualityConfig, cameras: list[str]) -> tuple[list[Episode], list[Episode]]:
-    """Episodes of the training data (none where it is not given) and those to judge on."""
+    """Episodes of the training data, if it is given, and those to judge on."""
     training = []
     if cfg.train_dataset is not None:
-        source = cfg.train_dataset
-        tasks = _tasks_of_both(source, cfg.dataset)
-        training = read_episodes(source, cameras, PROBE_EPISODES_PER_TASK, cfg.seed, tasks)
-    episodes = read_episodes(cfg.dataset, cameras, cfg.episodes_per_task, cfg.seed)
+        tasks = _check_tasks(cfg.train_dataset, cfg.dataset)
+        training = read_demonstrations(cfg.train_dataset, cameras, PROBE_EPISODES_PER_TASK, cfg.seed, tasks)
+    episodes = read_demonstrations(cfg.dataset, cameras, cfg.episodes_per_task, cfg.seed)
     n_long = sum(len(episode.actions) >= WINDOW for episode in episodes)
     if n_long < 2:
         raise ValueError(
-            f"{cfg.dataset.repo_id} has {n_long} episodes of {WINDOW} frames among the {len(episodes)} chosen; "
-            "open-loop prediction with shuffled actions needs 2."
+            f"{n_long} of the {len(episodes)} episodes chosen from {cfg.dataset.repo_id} have {WINDOW} frames or more; "
+            "open-loop prediction with shuffled actions needs 2 of them."
         )
     return training, episodes
 
 
-def _tasks_of_both(training: SourceConfig, judged_on: SourceConfig) -> list[str]:
-    """The tasks to judge on; a warning where there is training data of others, of which nothing can be tested.
+def _check_tasks(training: SourceConfig, judged_on: SourceConfig) -> list[str]:
+    """The tasks to judge on; warns of tasks of the training data that are not among them.
 
     Raises:
-        DatasetError: A dataset is not whole.
-        ValueError: There is no training data of a task to judge on.
+        ValueError: The training data lacks a task to judge on.
     """
-    trained, judged = _tasks(training), _tasks(judged_on)
+    trained, judged = (list(episodes_by_task(source.metadata())) for source in (training, judged_on))
     missing = [task for task in judged if task not in trained]
     if missing:
         raise ValueError(
-            f"{training.repo_id} has no episode of {', '.join(missing)}, which {judged_on.repo_id} has; it has "
-            f"{', '.join(trained)}: probes of a task are fitted on its training data. Judge on episodes of tasks that "
-            "the world model was trained on, or leave out --train_dataset for probes by cross-validation."
+            f"Probes of a task are fitted to its training data, but {training.repo_id} has no episode of "
+            f"{', '.join(missing)}; it has {', '.join(trained)}. Give a --dataset of tasks that the world model was "
+            "trained on, or leave out --train_dataset to use cross-validation."
         )
     left_out = [task for task in trained if task not in judged]
     if left_out:
-        logger.warning(
-            "%s has no episode of %s (of %s): the world model is not judged on that.",
-            judged_on.repo_id,
-            ", ".join(left_out),
-            training.repo_id,
-        )
+        logger.warning("%s is not judged: %s has no episode of it.", ", ".join(left_out), judged_on.repo_id)
     return judged
 
 
-def _tasks(data: SourceConfig) -> list[str]:
-    """The tasks that a dataset has episodes of."""
-    return list(episodes_by_task(data.metadata()))
-
-
 def _count_seen(training: list[Episode], episodes: list[Episode]) -> int:
-    """How many episodes start from positions that training episodes start from; a warning if any."""
+    """Count episodes that start from positions that training episodes start from; warns if there are any."""
     trained_on = set(start_positions(training))
     n_seen = sum(position in trained_on for position in start_positions(episodes))
     if n_seen:
         logger.warning(
-            "%d of %d episodes start from positions of the training data: collect others.",
+            "%d of %d episodes start from positions of the training data: the results are too good. Collect others.",
             n_seen,
             len(episodes),
         )
@@ -185,7 +174,7 @@ def _count_seen(training: list[Episode], episodes: list[Episode]) -> int:
 
 
 def untrained(world_model: WorldModel, seed: int) -> WorldModel:
-    """A world model of the same configuration and input scaling with fresh weights."""
+    """A world model of the same configuration and input scaling with new random weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         fresh = WorldModel(world_model.config)
@@ -201,6 +190,7 @@ def untrained(world_model: WorldModel, seed: int) -> WorldModel:
 def main() -> None:
     """Entry point of `lerobot-wm quality`."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    logging.getLogger("lerobot").setLevel(logging.ERROR)  # it warns of its video decoder once per episode
+    # It warns about its video decoder once per episode.
+    logging.getLogger("lerobot").setLevel(logging.ERROR)
     path = quality(draccus.parse(QualityConfig))
     print(f"World-model quality: {path}")

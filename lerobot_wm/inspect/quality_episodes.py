@@ -1,4 +1,4 @@
-"""Demonstrations and what the world model's filter makes of them, in memory."""
+"""Demonstrations in memory, and what the world model's filter makes of them."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -20,21 +20,32 @@ from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import RSSMState
 
 NEEDED = (ACTION, OBS_STATE, OBS_ENV_STATE, SUCCESS, VARIATION)
-_PLACED = [4, 5, 6, 36, 37, 38]  # first object and goal in Meta-World's 39-dimensional state
+# First object and goal in Meta-World's 39-dimensional state.
+_POSITIONS = [4, 5, 6, 36, 37, 38]
 _EPISODES_PER_BATCH = 16
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One demonstration of T frames; what arrives with o_{t+1} stands at frame t."""
+    """One demonstration of T frames; what arrives with o_{t+1} is stored at frame t.
+
+    Attributes:
+        task: The task.
+        variation: Which of its fixed variations.
+        frames: Each camera's frames, (T, 64, 64, C) uint8, views of the memory-mapped cache.
+        actions: (T, A).
+        proprio: (T, P).
+        env_state: (T, 39).
+        success: (T,) bool.
+    """
 
     task: str
     variation: int
-    frames: list[Tensor]  # of each camera (T, 64, 64, C) uint8, a view of the memory-mapped cache
-    actions: Tensor  # (T, A)
-    proprio: Tensor  # (T, P)
-    env_state: Tensor  # (T, 39)
-    success: Tensor  # (T,) bool
+    frames: list[Tensor]
+    actions: Tensor
+    proprio: Tensor
+    env_state: Tensor
+    success: Tensor
 
     def images(self, steps: slice | list[int]) -> Tensor:
         """The images of these steps as the world model sees them, (N, C, 64, 64) in [0, 1]."""
@@ -44,11 +55,17 @@ class Episode:
 
 @dataclass(frozen=True)
 class Filtered:
-    """The closed loop over one episode of T frames: the filter sees every image; z_t is the posterior mean."""
+    """The closed loop over one episode of T frames: the filter sees every image; z_t is the posterior mean.
 
-    states: RSSMState  # (T, ·)
-    embeds: Tensor  # (T, E)
-    kl: Tensor  # (T,) KL(posterior || prior) in nats
+    Attributes:
+        states: (T, ·).
+        embeds: (T, E).
+        kl: KL(posterior || prior) in nats, (T,).
+    """
+
+    states: RSSMState
+    embeds: Tensor
+    kl: Tensor
 
     @property
     def latents(self) -> Tensor:
@@ -57,12 +74,12 @@ class Filtered:
 
 
 def choose_episodes(episodes: pd.DataFrame, per_task: int, seed: int) -> list[int]:
-    """Up to `per_task` episodes of each task, spread evenly over its variations.
+    """Choose up to `per_task` episodes of each task, spread evenly over its variations.
 
     Args:
         episodes: One row per episode: `episode_index`, `task_index`, `variation`.
-        per_task: Episodes wanted of each task.
-        seed: Seed of the order of variations, and of episodes within one.
+        per_task: Episodes of each task.
+        seed: Seed of the choice.
 
     Returns:
         Sorted episode indices.
@@ -73,31 +90,31 @@ def choose_episodes(episodes: pd.DataFrame, per_task: int, seed: int) -> list[in
     return sorted(by_turn.groupby("task_index").head(per_task)["episode_index"].tolist())
 
 
-def read_episodes(
+def read_demonstrations(
     source: SourceConfig,
     cameras: list[str],
     per_task: int,
     seed: int,
     of_tasks: Collection[str] | None = None,
 ) -> list[Episode]:
-    """Episodes of a Meta-World dataset; only those chosen are decoded.
+    """Read some episodes of a Meta-World dataset; no others are decoded.
 
     Args:
         source: The dataset.
-        cameras: Whose frames are read.
-        per_task: Episodes wanted of each task.
+        cameras: Whose frames to read.
+        per_task: Episodes of each task.
         seed: Seed of the choice, see `choose_episodes`.
-        of_tasks: The tasks whose episodes are wanted; None for all.
+        of_tasks: The tasks; None for all.
 
     Raises:
-        DatasetError: The dataset is not whole.
-        ValueError: The dataset lacks a feature, such as the objects' true positions.
+        DatasetError: The dataset is damaged.
+        ValueError: The dataset lacks a feature, such as the objects' positions.
     """
     meta = source.metadata()
     missing = [key for key in (*cameras, *NEEDED) if key not in meta.features]
     if missing:
         raise ValueError(
-            f"{source.repo_id} has no {missing}, which judging a world model needs: use a dataset of "
+            f"{source.repo_id} has no {', '.join(missing)}, which `lerobot-wm quality` needs. Give a dataset of "
             "`lerobot-wm collect`."
         )
     dataset = LeRobotDataset(source.repo_id, root=source.root, revision=source.revision)
@@ -112,9 +129,8 @@ def read_episodes(
         table = table[table["task_index"].isin([i for i, task in enumerate(tasks) if task in of_tasks])]
     chosen = choose_episodes(table.drop_duplicates("episode_index"), per_task, seed)
     dataset = LeRobotDataset(source.repo_id, root=source.root, revision=source.revision, episodes=chosen)
-    of_cameras = [
-        camera_frames(dataset, key, (IMAGE_SIZE, IMAGE_SIZE)) for key in cameras
-    ]  # (N, 64, 64, C) each, by absolute index
+    # Each camera's (N, 64, 64, C), by absolute index.
+    of_cameras = [camera_frames(dataset, key, (IMAGE_SIZE, IMAGE_SIZE)) for key in cameras]
     columns = {
         key: column_tensor(dataset.hf_dataset, key, tuple(dataset.meta.features[key]["shape"]))
         for key in (*NEEDED, "episode_index", "index", "task_index")
@@ -142,7 +158,7 @@ def filter_episodes(world_model: WorldModel, episodes: list[Episode]) -> list[Fi
     results = []
     for begin in trange(0, len(episodes), _EPISODES_PER_BATCH, desc="Filtering", unit="batch"):
         batch = episodes[begin : begin + _EPISODES_PER_BATCH]
-        # The filter is causal: what pads the shorter episodes comes after their last frame.
+        # The filter is causal, so padding after a shorter episode's last frame does not change its states.
         embeds = pad_sequence([_embed(world_model, episode, device) for episode in batch], batch_first=True)
         actions = pad_sequence([episode.actions for episode in batch], batch_first=True)  # (B, T, A)
         states, kl = world_model.filter_with_kl(embeds, actions.to(device))  # (B, T, ·), (B, T)
@@ -160,5 +176,5 @@ def _embed(world_model: WorldModel, episode: Episode, device: torch.device) -> T
 
 
 def start_positions(episodes: list[Episode]) -> list[tuple[str, ...]]:
-    """Task, object and goal at each episode's first frame: equal, to the last bit, for one variation."""
-    return [(episode.task, *map(str, episode.env_state[0, _PLACED].tolist())) for episode in episodes]
+    """Task, object and goal at each episode's first frame: equal to the bit for equal variations."""
+    return [(episode.task, *map(str, episode.env_state[0, _POSITIONS].tolist())) for episode in episodes]

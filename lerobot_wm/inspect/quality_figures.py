@@ -1,8 +1,5 @@
-"""Figures of world-model quality, drawn from quality.json (and the example images from memory)."""
+"""Figures of world-model quality, drawn from the content of quality.json; the examples from images in memory."""
 
-import json
-from dataclasses import dataclass
-from pathlib import Path
 from textwrap import fill
 from typing import Any
 
@@ -11,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from lerobot_wm.inspect.html import PNG, SVG, data_uri, figure_bytes, template_environment
+from lerobot_wm.inspect.open_loop import HORIZONS
 
 EXAMPLES_NAME = "quality_examples.png"
 EXAMPLE_HORIZON = 20
@@ -30,13 +27,12 @@ def quality_figures(result: dict[str, Any]) -> dict[str, Figure]:
     }
 
 
-def examples_figure(images: dict[str, Tensor], tasks: list[str], horizons: tuple[int, ...]) -> Figure:
-    """One row per task: the last frame seen, the truth EXAMPLE_HORIZON steps on, and the predictions of it.
+def examples_figure(images: dict[str, Tensor], tasks: list[str]) -> Figure:
+    """One row per task: the last frame seen, the truth EXAMPLE_HORIZON steps later, and the predictions of it.
 
     Args:
-        images: As `quality_open_loop.predictions` returns them, each (E, H, C, h, w).
+        images: As `quality_measures.predictions` returns them, each (E, H, C, h, w).
         tasks: The task of each of the E episodes; the first of each is shown.
-        horizons: The H horizons.
     """
     columns = ("copy last frame", "truth", "closed loop", "open loop", "shuffled actions")
     names = list(dict.fromkeys(tasks))
@@ -48,7 +44,7 @@ def examples_figure(images: dict[str, Tensor], tasks: list[str], horizons: tuple
         episode = tasks.index(task)
         row[0].set_ylabel(fill(task, 16), fontsize=8, rotation=0, ha="right", va="center")
         for axis, column in zip(row, columns, strict=True):
-            image = images[column][episode, horizons.index(EXAMPLE_HORIZON)].movedim(0, -1)  # (h, w, C)
+            image = images[column][episode, HORIZONS.index(EXAMPLE_HORIZON)].movedim(0, -1)  # (h, w, C)
             axis.imshow(image.numpy(), interpolation="nearest")
             axis.set_xticks([])
             axis.set_yticks([])
@@ -58,22 +54,15 @@ def examples_figure(images: dict[str, Tensor], tasks: list[str], horizons: tuple
 
 
 def _open_loop_figure(table: pd.DataFrame) -> Figure:
-    """Error against horizon over all tasks (the last of the table), one line per prediction."""
+    """Error against horizon over all tasks, which come last in the table; one line per prediction."""
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     overall = table[table["task"] == table["task"].iloc[-1]]
     for axes, (column, label) in zip(figure.subplots(1, 3), _LABELS.items(), strict=True):
         for colour, (prediction, group) in zip(
             _COLOURS, overall.groupby("prediction", sort=False), strict=True
         ):
-            axes.plot(
-                group["horizon"],
-                group[column],
-                "o-",
-                color=colour,
-                markersize=3,
-                linewidth=1.2,
-                label=prediction,
-            )
+            style = {"color": colour, "markersize": 3, "linewidth": 1.2, "label": prediction}
+            axes.plot(group["horizon"], group[column], "o-", **style)
         axes.set_xlabel("steps ahead", fontsize=8)
         _tidy(axes, label)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
@@ -117,14 +106,9 @@ def _drift_figure(table: pd.DataFrame, restart: int) -> Figure:
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot(table["step"], table["psnr"], color=_COLOURS[0], linewidth=1.2, label="from the first frame on")
-    left.plot(
-        table["step"],
-        table["restarted_psnr"],
-        "--",  # it hides nothing where both are equal
-        color=_COLOURS[1],
-        linewidth=1.2,
-        label=f"restarted {restart - 1} steps before",
-    )
+    # Dashes leave both visible where they are equal.
+    style = {"color": _COLOURS[1], "linewidth": 1.2, "label": f"restarted {restart - 1} steps before"}
+    left.plot(table["step"], table["restarted_psnr"], "--", **style)
     right.plot(table["step"], table["kl"], color=_COLOURS[0], linewidth=1.2)
     right.set_yscale("log")
     for axes, label in ((left, "reconstruction PSNR (dB)"), (right, "KL per step (nats)")):
@@ -139,124 +123,3 @@ def _tidy(axes: Axes, title: str) -> None:
     axes.set_title(title, fontsize=10)
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.3)
-
-
-_ABSENT = "–"
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A number and, small beside it, what else belongs to it."""
-
-    text: str
-    small: str = ""
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows by name, the last `n_totals` of them set off."""
-
-    corner: str
-    columns: list[str]
-    rows: dict[str, list[Cell]]
-    n_totals: int = 0
-
-
-def quality_section(path: Path) -> str:
-    """HTML of `<h3>World-model quality</h3>` and what follows, figures inlined; styled by the page's classes.
-
-    Args:
-        path: A quality.json of `lerobot-wm quality`, with the picture of examples beside it.
-
-    Raises:
-        FileNotFoundError: One of the two is missing.
-    """
-    examples = path.with_name(EXAMPLES_NAME)
-    for needed in (path, examples):
-        if not needed.is_file():
-            raise FileNotFoundError(
-                f"{needed} is missing: expected the quality.json of `lerobot-wm quality` in its output folder."
-            )
-    result = json.loads(path.read_text())
-    environment = template_environment()
-    return environment.get_template("quality_section.html.j2").render(
-        result,
-        figures={
-            name: data_uri(figure_bytes(figure, SVG), SVG) for name, figure in quality_figures(result).items()
-        },
-        examples=data_uri(examples.read_bytes(), PNG),
-        example_horizon=EXAMPLE_HORIZON,
-        kl_overall=result["kl"]["tasks"][-1],
-        open_loop_table=_open_loop_table(pd.DataFrame(result["open_loop"])),
-        foreground_table=_foreground_table(pd.DataFrame(result["open_loop"])),
-        reward_table=_reward_table(result["reward"]) if result["reward"] else None,
-        probe_tables=_probe_tables(pd.DataFrame(result["probes"])),
-        kl_table=_kl_table(result["kl"]["tasks"]),
-    )
-
-
-def _open_loop_table(table: pd.DataFrame) -> Table:
-    """Predictions down, horizons across, over all tasks."""
-    overall = table[table["task"] == table["task"].iloc[-1]]
-    rows = {
-        prediction: [
-            Cell(_number(row.foreground_psnr, 1), f"{row.psnr:.1f} · {row.ssim:.2f}")
-            for row in group.itertuples()
-        ]
-        for prediction, group in overall.groupby("prediction", sort=False)
-    }
-    return Table("prediction", [f"+{horizon}" for horizon in overall["horizon"].unique()], rows)
-
-
-def _foreground_table(table: pd.DataFrame) -> Table:
-    """Tasks down, predictions across: foreground PSNR at EXAMPLE_HORIZON."""
-    chosen = table[table["horizon"] == EXAMPLE_HORIZON]
-    rows = {
-        task: [Cell(_number(value, 1)) for value in group["foreground_psnr"]]
-        for task, group in chosen.groupby("task", sort=False)
-    }
-    return Table("task", list(chosen["prediction"].unique()), rows, n_totals=1)
-
-
-def _reward_table(rows: list[dict[str, Any]]) -> Table:
-    cells = {
-        row["task"]: [
-            Cell(f"{100 * row['base_rate']:.1f}%"),
-            Cell(_number(row["average_precision"], 2)),
-            Cell(_number(row["auroc"], 3)),
-        ]
-        for row in rows
-    }
-    return Table("task", ["base rate", "average precision", "AUROC"], cells, n_totals=1)
-
-
-def _probe_tables(table: pd.DataFrame) -> dict[str, Table]:
-    """One table per target: tasks down, representations across."""
-    tables = {}
-    for target, group in table.groupby("target", sort=False):
-        rows = {
-            task: [
-                Cell(f"{row.median_cm:.1f}", f"{row.mean_cm:.1f} · {row.r2:.2f}")
-                for row in of_task.itertuples()
-            ]
-            for task, of_task in group.groupby("task", sort=False)
-        }
-        tables[str(target)] = Table("task", list(group["representation"].unique()), rows, n_totals=1)
-    return tables
-
-
-def _kl_table(tasks: list[dict[str, Any]]) -> Table:
-    names = list(tasks[0]["percentiles"])
-    rows = {
-        task["task"]: [
-            Cell(f"{100 * task['share_under_free_nats']:.0f}%"),
-            Cell(f"{task['mean']:.1f}"),
-            *(Cell(f"{task['percentiles'][name]:.1f}") for name in names),
-        ]
-        for task in tasks
-    }
-    return Table("task", ["under free nats", "mean", *(f"{name}%" for name in names)], rows, n_totals=1)
-
-
-def _number(value: float | None, digits: int) -> str:
-    return _ABSENT if value is None or pd.isna(value) else f"{value:.{digits}f}"

@@ -1,7 +1,6 @@
-"""Linear probes: what can be read from the latents on variations that the probe was not fitted on."""
+"""Linear probes: what can be read from the latents on variations that the probe was not fitted to."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import pandas as pd
@@ -10,7 +9,7 @@ from sklearn.dummy import DummyClassifier, DummyRegressor
 from sklearn.linear_model import LogisticRegression, Ridge
 from sklearn.metrics import r2_score
 from sklearn.model_selection import GridSearchCV, GroupKFold
-from sklearn.pipeline import make_pipeline
+from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
@@ -26,49 +25,48 @@ MEAN_OF_TASKS = "mean of tasks"
 
 FRAMES_PER_EPISODE = 15
 FOLDS = 5
-# Ridge penalties, for standardised features and some hundred frames: wide enough that latents, embeddings and
-# components each find theirs inside.
+# Ridge penalties, for standardised features and some hundred frames: wide enough that the best one for latents,
+# embeddings and components each lies inside.
 ALPHAS = tuple(np.logspace(-3, 5, 9))
 _LOGISTIC_ITERATIONS = 1000
 _CM = 100.0
 
-Split = tuple[np.ndarray, np.ndarray]  # rows to fit on, rows to test on
-
-
-class Probe(Protocol):
-    """What fits here: a scikit-learn estimator."""
-
-    def fit(self, x: np.ndarray, y: np.ndarray) -> "Probe":
-        """Fit to features (N, D) and targets."""
-
-    def predict(self, x: np.ndarray) -> np.ndarray:
-        """Predict targets for features (N, D)."""
+# Rows to fit to and rows to test on.
+Split = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Frames:
-    """N frames drawn from episodes, in the representations compared."""
+    """N frames drawn from episodes.
 
-    features: dict[str, np.ndarray]  # (N, ·) float64 by representation; float32 loses the smallest penalties
-    env_state: np.ndarray  # (N, 39), m
-    tasks: np.ndarray  # (N,) task strings
-    variations: np.ndarray  # (N,) what frames are split by, never by frame
-    to_fit: np.ndarray | None  # (N,) bool, frames of the training data; None: fit by cross-validation
+    Attributes:
+        features: The representations that are compared, (N, ·) float64 each: float32 loses the smallest penalties.
+        env_state: (N, 39), in m.
+        tasks: (N,) task strings.
+        variations: (N,); frames are split by these, never one by one.
+        to_fit: (N,) bool, the frames of the training data; None fits by cross-validation.
+    """
+
+    features: dict[str, np.ndarray]
+    env_state: np.ndarray
+    tasks: np.ndarray
+    variations: np.ndarray
+    to_fit: np.ndarray | None
 
 
 def draw_frames(
     episodes: list[Episode], filtered: list[Filtered], untrained: list[Filtered], n_fit: int, seed: int
 ) -> Frames:
-    """FRAMES_PER_EPISODE frames of each episode, at random.
+    """Draw FRAMES_PER_EPISODE frames of each episode at random.
 
-    The principal components are as many as the latent has dimensions (or there are frames), and are fitted to
-    the frames of the training data; without those, to all frames, which favours them a little.
+    There are as many principal components as the latent has dimensions (or as there are frames). They are fitted to the
+    frames of the training data; without those to all frames, which favours them a little.
 
     Args:
         episodes: Episodes of the training data first, then held-out ones.
         filtered: Their closed loops.
         untrained: Their closed loops under an untrained world model.
-        n_fit: How many of the episodes are training data; with 0 probes are fitted by cross-validation.
+        n_fit: How many of the episodes are training data; 0 fits probes by cross-validation.
         seed: Seed of the draw and of the principal components.
     """
     rng = np.random.default_rng(seed)
@@ -119,18 +117,18 @@ def _scores(pca: PCA, pixels: np.ndarray) -> np.ndarray:
 
 
 def splits(frames: Frames, rows: np.ndarray) -> list[Split]:
-    """How `rows` are divided: the training data against the rest, or in folds that share no variation.
+    """Split `rows` into the training data and the rest, or into folds that share no variation.
 
     Raises:
-        ValueError: Too few variations to fit on some, choose the penalty on others and test on a third.
+        ValueError: There are too few variations to fit, choose the penalty and test on different ones.
     """
     variations = frames.variations[rows]
     n = len(np.unique(variations if frames.to_fit is None else variations[frames.to_fit[rows]]))
     needed = 3 if frames.to_fit is None else 2
     if n < needed:
         raise ValueError(
-            f"Probes of '{frames.tasks[rows[0]]}' have {n} variation(s) to be fitted on, and need {needed}: use a "
-            "dataset with more variations, or raise --episodes_per_task."
+            f"Probes of '{frames.tasks[rows[0]]}' need {needed} variations to fit, and there are {n}. Use a dataset "
+            "with more variations, or raise --episodes_per_task."
         )
     if frames.to_fit is not None:
         fit = frames.to_fit[rows]
@@ -139,14 +137,15 @@ def splits(frames: Frames, rows: np.ndarray) -> list[Split]:
     return [(rows[fit], rows[test]) for fit, test in folds]
 
 
-def fit_ridge(x: np.ndarray, y: np.ndarray, variations: np.ndarray, *, standardise: bool = True) -> Probe:
-    """Ridge regression (N, D) -> (N, 3) whose penalty does best on variations left out of the fit.
+def fit_ridge(x: np.ndarray, y: np.ndarray, variations: np.ndarray, *, standardise: bool) -> Pipeline:
+    """Ridge regression (N, D) -> (N, 3) whose penalty does best on variations that were left out.
 
     Args:
-        x: Features, standardised here unless their scale has a meaning, as that of principal components has.
+        x: Features.
         y: Targets.
-        variations: What folds are split by, (N,).
-        standardise: Give every feature a variance of 1.
+        variations: Folds share none of these, (N,).
+        standardise: Give every feature a variance of 1; not where their scales mean something, as in principal
+            components.
     """
     folds = GroupKFold(min(FOLDS, len(np.unique(variations))))
     search = GridSearchCV(Ridge(), {"alpha": ALPHAS}, cv=folds, scoring="neg_mean_squared_error")
@@ -157,19 +156,19 @@ def fit_ridge(x: np.ndarray, y: np.ndarray, variations: np.ndarray, *, standardi
 def probe_positions(frames: Frames) -> list[dict]:
     """Error of object, gripper and goal position per task and representation, and its mean over tasks.
 
-    One probe per task, since what the object is differs between tasks. `r2` is the share of the held-out
+    There is one probe per task, since the object differs between tasks. `r2` is the share of the held-out
     positions' variance that is explained, summed over x, y and z; below 0 is worse than their mean.
     """
     rows = []
     for task in tqdm(dict.fromkeys(frames.tasks.tolist()), desc="Probing", unit="task"):
         of_task = np.flatnonzero(frames.tasks == task)
-        parts = splits(frames, of_task)
+        divided = splits(frames, of_task)
         for target, columns in TARGETS.items():
             truth = frames.env_state[:, columns]  # (N, 3)
             for name in REPRESENTATIONS:
                 x = frames.features[name]
                 tested, predicted = [], []
-                for fit, test in parts:
+                for fit, test in divided:
                     if name == BLIND:
                         probe = DummyRegressor().fit(x[fit], truth[fit])
                     else:
@@ -195,22 +194,20 @@ def probe_positions(frames: Frames) -> list[dict]:
 
 
 def probe_task(frames: Frames) -> list[dict]:
-    """Share of frames whose task a logistic regression tells, by representation; empty where there is one task."""
+    """Share of frames whose task a logistic regression finds, by representation; empty where there is one task."""
     if len(set(frames.tasks)) == 1:
         return []
     rows = []
-    parts = splits(frames, np.arange(len(frames.tasks)))
+    divided = splits(frames, np.arange(len(frames.tasks)))
     for name in REPRESENTATIONS:
         x = frames.features[name]
         correct = []
-        for fit, test in parts:
-            probe = (
-                DummyClassifier()
-                if name == BLIND
-                else make_pipeline(
-                    StandardScaler(with_std=name != PIXELS), LogisticRegression(max_iter=_LOGISTIC_ITERATIONS)
-                )
-            )
+        for fit, test in divided:
+            if name == BLIND:
+                probe = DummyClassifier()
+            else:
+                scaler = StandardScaler(with_std=name != PIXELS)
+                probe = make_pipeline(scaler, LogisticRegression(max_iter=_LOGISTIC_ITERATIONS))
             probe.fit(x[fit], frames.tasks[fit])
             correct.append(probe.predict(x[test]) == frames.tasks[test])
         rows.append({"representation": name, "accuracy": float(np.concatenate(correct).mean())})

@@ -1,4 +1,4 @@
-"""Paired comparison of two arms over the rollouts that both made."""
+"""Paired comparison of two arms on the variations that both were rolled out on."""
 
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
@@ -7,9 +7,8 @@ import numpy as np
 from scipy.stats import binomtest
 from scipy.stats import t as student_t
 
-from lerobot_wm.records import Record
+from lerobot_wm.records import RNG_SEED, Record, percentile_interval, resample
 from lerobot_wm.report.arms import ARMS, WM_RSSM
-from lerobot_wm.statistics import RNG_SEED, percentile_interval, resample
 
 # Each of these is compared with every other arm.
 COMPARED_ARMS = ("wm_iql", "wm_bc")
@@ -18,25 +17,31 @@ DENSE_SUFFIX = "_dense"
 SHARING_WORLD_MODEL = frozenset(arm.name for arm in ARMS.values() if arm.encoder is WM_RSSM)
 
 
-def by_arm(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Records by arm: arms in the order of `ARMS`, then unknown ones as they come."""
-    found: dict[str, list[Record]] = {}
+def group_by_arm(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Group records by arm: arms in the order of `ARMS`, then others in the order they occur."""
+    groups: dict[str, list[Record]] = {}
     for record in records:
-        found.setdefault(record["arm"], []).append(record)
-    known = [arm for arm in ARMS if arm in found]
-    return {arm: found[arm] for arm in [*known, *(arm for arm in found if arm not in ARMS)]}
+        groups.setdefault(record["arm"], []).append(record)
+    known = [arm for arm in ARMS if arm in groups]
+    return {arm: groups[arm] for arm in dict.fromkeys([*known, *groups])}
 
 
-SIGNIFICANCE = 0.05  # McNemar's test below which arms are called different, where it can be made
+# Where McNemar's test can be made, its p value must be below this for arms to be called different.
+SIGNIFICANCE = 0.05
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Success of `arm` minus that of `other`, in percentage points, over `n_pairs` rollouts of each.
+    """Success of `arm` minus that of `other`, in percentage points.
 
-    `interval` covers the choice of variations, `training_interval` that of trainings; the latter is None where an arm
-    has one. `only_arm` and `only_other` count the pairs where just that one succeeded. `p_value` is that of the exact
-    McNemar test, None where several trainings of an arm make the pairs of a variation dependent.
+    Attributes:
+        arm, other: The arms.
+        n_pairs: Pairs of rollouts that were compared.
+        difference: Mean difference.
+        interval: 95% interval over the choice of variations.
+        seed_interval: 95% interval over training seeds; None where an arm has one seed.
+        only_arm, only_other: Pairs in which only that arm succeeded.
+        p_value: Of the exact McNemar test; None where an arm has several seeds, which makes pairs dependent.
     """
 
     arm: str
@@ -44,7 +49,7 @@ class Comparison:
     n_pairs: int
     difference: float
     interval: tuple[float, float]
-    training_interval: tuple[float, float] | None
+    seed_interval: tuple[float, float] | None
     only_arm: int
     only_other: int
     p_value: float | None
@@ -53,11 +58,12 @@ class Comparison:
     def verdict(self) -> str:
         """The comparison in words.
 
-        The bootstrap is too sure of itself where few pairs differ: four won and none lost exclude zero at p 0.125.
+        The bootstrap interval is too narrow where few pairs differ: with four won and none lost it excludes zero at
+        p 0.125, so the McNemar test decides too.
         """
-        intervals = [self.interval, *([self.training_interval] if self.training_interval else [])]
-        zero_in = any(low <= 0 <= high for low, high in intervals)
-        if zero_in or (self.p_value is not None and self.p_value >= SIGNIFICANCE):
+        intervals = [self.interval, *([self.seed_interval] if self.seed_interval else [])]
+        includes_zero = any(low <= 0 <= high for low, high in intervals)
+        if includes_zero or (self.p_value is not None and self.p_value >= SIGNIFICANCE):
             return "no difference shown"
         excludes = "intervals exclude" if len(intervals) > 1 else "interval excludes"
         return f"{'better' if self.difference > 0 else 'worse'} ({excludes} zero)"
@@ -66,21 +72,21 @@ class Comparison:
 def compare(records: list[Record], others: list[Record]) -> Comparison | None:
     """Compare two arms over the variations that both were rolled out on; None where they share none.
 
-    Each training of the one is paired with each of the other: equal training seeds make two trainings no more alike
-    than unequal ones, and picking one would compare with a lucky or an unlucky one. Only arms on a shared world model
-    (`SHARING_WORLD_MODEL`) are paired seed by seed: there a seed is one world model, good or bad for both.
+    Each seed of one arm is paired with each seed of the other: equal seeds make two runs no more alike than unequal
+    ones, and a single pair could be a lucky one. Only arms on a shared world model (`SHARING_WORLD_MODEL`) are paired
+    seed by seed, since there a seed stands for one world model.
 
-    The difference is averaged over the pairs of a variation, the variations of a task and then the tasks. The interval
-    is a percentile bootstrap that resamples variations within each task: a variation is drawn with all of its pairs,
-    since rollouts on one variation are not independent. It covers the choice of variations. That of trainings is
-    covered by a t interval over the trainings' success on these variations: Welch's of two samples, or of the
-    differences between arms on a shared world model.
+    The difference is averaged over the pairs of a variation, the variations of a task, and the tasks. `interval` is a
+    percentile bootstrap that resamples variations within each task, each with all of its pairs, since rollouts on one
+    variation are not independent. `seed_interval` is a t interval over the seeds' success on these variations: Welch's
+    for two samples, or that of the differences between arms on a shared world model.
     """
     arm, other = records[0]["arm"], others[0]["arm"]
     seed_by_seed = {arm, other} <= SHARING_WORLD_MODEL
     ours, theirs = _by_variation(records), _by_variation(others)
-    trainings: set[tuple[int | None, int | None]] = set()
-    pairs: dict[str, list[list[int]]] = {}  # task -> variation -> differences of its pairs
+    seed_pairs: set[tuple[int | None, int | None]] = set()
+    # Task -> each variation's differences.
+    pairs: dict[str, list[list[int]]] = {}
     for task, variation in sorted(ours.keys() & theirs.keys(), key=str):
         found = {
             (seed, other_seed): success - other_success
@@ -90,7 +96,7 @@ def compare(records: list[Record], others: list[Record]) -> Comparison | None:
         }
         if found:
             pairs.setdefault(task, []).append(list(found.values()))
-            trainings |= found.keys()
+            seed_pairs |= found.keys()
     if not pairs:
         return None
     rng = np.random.default_rng(RNG_SEED)
@@ -107,20 +113,20 @@ def compare(records: list[Record], others: list[Record]) -> Comparison | None:
         n_pairs=len(flat),
         difference=100 * float(np.mean(differences)),
         interval=percentile_interval(100 * np.mean(draws, axis=0)),
-        training_interval=_over_trainings(
-            _rates(ours, {seed for seed, _ in trainings}, theirs),
-            _rates(theirs, {seed for _, seed in trainings}, ours),
+        seed_interval=_interval_over_seeds(
+            _rates(ours, {seed for seed, _ in seed_pairs}, theirs),
+            _rates(theirs, {seed for _, seed in seed_pairs}, ours),
             seed_by_seed,
         ),
         only_arm=only_arm,
         only_other=only_other,
-        p_value=_mcnemar(only_arm, only_other) if len(trainings) == 1 else None,
+        p_value=_mcnemar(only_arm, only_other) if len(seed_pairs) == 1 else None,
     )
 
 
 def compare_arms(records: list[Record]) -> dict[str, list[Comparison]]:
-    """Each arm of `COMPARED_ARMS` against every other arm that shares rollouts with it, in the order of tables."""
-    arms = by_arm(records)
+    """Compare each arm of `COMPARED_ARMS` with every other arm that shares variations with it, in table order."""
+    arms = group_by_arm(records)
     compared = {
         arm: [compare(arms[arm], arms[other]) for other in arms if other != arm]
         for arm in COMPARED_ARMS
@@ -143,7 +149,7 @@ def _rates(
     seeds: set[int | None],
     shared: Container[tuple[str, int]],
 ) -> list[float]:
-    """Success of each training in per cent, in the order of seeds: of the shared variations, averaged over tasks."""
+    """Success of each seed in percent, in the order of seeds: on the shared variations, averaged over tasks."""
     rates = []
     for seed in sorted(seeds, key=str):
         of_task: dict[str, list[bool]] = {}
@@ -154,10 +160,10 @@ def _rates(
     return rates
 
 
-def _over_trainings(ours: list[float], theirs: list[float], paired: bool) -> tuple[float, float] | None:
-    """95% t interval of the difference between trainings' means; None where an arm has one training.
+def _interval_over_seeds(ours: list[float], theirs: list[float], paired: bool) -> tuple[float, float] | None:
+    """95% t interval of the difference between the means over seeds; None where an arm has one seed.
 
-    Welch's for two samples. SciPy's own warns where trainings of an arm succeed alike, which here is nothing unusual.
+    SciPy's Welch interval would warn where all seeds of an arm succeed equally often, which is common here.
     """
     if min(len(ours), len(theirs)) < 2:
         return None
@@ -174,6 +180,6 @@ def _over_trainings(ours: list[float], theirs: list[float], paired: bool) -> tup
 
 
 def _mcnemar(only_arm: int, only_other: int) -> float:
-    """Two-sided exact McNemar test: under equality each discordant pair is a fair coin (McNemar 1947)."""
+    """Two-sided exact McNemar test: if the arms are equal, each pair that differs is a fair coin (McNemar 1947)."""
     discordant = only_arm + only_other
     return float(binomtest(only_arm, discordant).pvalue) if discordant else 1.0

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from lerobot_wm.constants import REPORTED_VARIATION_SET, VARIATION_SETS
 from lerobot_wm.envs.variations import rand_vec
-from lerobot_wm.records import Record, read_records
-from lerobot_wm.statistics import in_split, success_rate
+from lerobot_wm.records import Record, is_in_split, read_records, success_rate
 
 TASK = "reach-v3"
 EDGES_CM = (5, 10, 15, 20, 25, 30)
@@ -35,7 +34,7 @@ def main() -> None:
     records = [
         record
         for record in read_records([arguments.records])
-        if record["task"] == TASK and in_split(record, "unseen")
+        if record["task"] == TASK and is_in_split(record, "unseen")
     ]
     bands = list(itertools.pairwise(EDGES_CM))
     print("arm", *(f"{low}-{high} cm" for low, high in bands), sep=" | ")

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_wm.constants import TRAIN_LOG_NAME
-from lerobot_wm.records import Record, provenance, read_records
+from lerobot_wm.records import Record, provenance, read_records, success_rate
 from lerobot_wm.report.comparison import compare
-from lerobot_wm.statistics import success_rate
 
 MONITORED = {
     "wm_rssm": ("image_loss", "reward_loss", "kl"),

@@ -131,8 +131,8 @@ def test_the_command_evaluates_where_the_policy_was_trained(
 @pytest.mark.parametrize(
     ("other", "said"),
     [
-        ({"arm": "wm_iql"}, "arms wm_bc, wm_iql"),
-        ({"policy_type": "wm_iql"}, "wm_iql with"),
+        ({"arm": "wm_iql"}, "arm wm_iql"),
+        ({"policy_type": "wm_iql"}, "wm_iql"),
         ({"seed": 1}, "seed 1"),
     ],
 )

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from lerobot_wm.inspect.open_loop import load_world_model
+from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.world_model.model import WorldModel
 
 

@@ -5,8 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from lerobot_wm.records import Record
-from lerobot_wm.statistics import run_statistics
+from lerobot_wm.records import Record, run_statistics
 
 CHANCES = np.array([0.9, 0.95, 0.97, 0.5, 0.98, 0.85])  # of success on six tasks
 SIMULATIONS = 100

@@ -24,12 +24,12 @@ def test_known_difference_and_mcnemar(make_records: Callable) -> None:
     assert found.difference == pytest.approx(16)
     assert (found.only_arm, found.only_other) == (8, 0)
     assert found.p_value == pytest.approx(2 / 2**8)
-    assert found.verdict == "better (interval excludes zero)"
+    assert found.verdict.startswith("better")
 
     reverse = compare(theirs, ours)
     assert reverse.difference == pytest.approx(-16)
     assert reverse.interval == pytest.approx((-found.interval[1], -found.interval[0]), abs=2)
-    assert reverse.verdict == "worse (interval excludes zero)"
+    assert reverse.verdict.startswith("worse")
 
 
 def test_what_mcnemars_test_does_not_tell_apart_is_not_called_better(make_records: Callable) -> None:
@@ -38,13 +38,13 @@ def test_what_mcnemars_test_does_not_tell_apart_is_not_called_better(make_record
     )
     assert (found.only_arm, found.only_other, found.p_value) == (4, 0, 0.125)
     assert found.interval[0] > 0
-    assert found.verdict == "no difference shown"
+    assert found.verdict.startswith("no difference")
 
 
 def test_equal_arms(make_records: Callable) -> None:
     found = compare(make_records("wm_bc", TASKS), make_records("wm_iql", TASKS))
     assert (found.difference, found.interval, found.p_value) == (0, (0, 0), 1)
-    assert found.verdict == "no difference shown"
+    assert found.verdict.startswith("no difference")
 
 
 def test_tasks_weigh_the_same(make_records: Callable) -> None:
@@ -67,7 +67,7 @@ def test_seeds_of_one_variation_are_not_independent(make_records: Callable) -> N
 
 
 def runs(arm: str, successes: list[int]) -> list[Record]:
-    """Trainings with so many successes on 40 variations of one task."""
+    """Seeds with so many successes on 40 variations of one task."""
     return [
         {"arm": arm, "seed": seed, "task": "reach-v3", "variation": k, "success": k < n}
         for seed, n in enumerate(successes)
@@ -75,31 +75,31 @@ def runs(arm: str, successes: list[int]) -> list[Record]:
     ]
 
 
-def test_trainings_that_differ_are_told_apart_by_their_spread() -> None:
-    """Two lucky trainings of three win on almost all variations and show nothing of the next training."""
+def test_the_interval_over_seeds_is_welchs() -> None:
+    """Two lucky seeds of three win on almost all variations, and say nothing about the next seed."""
     ours, theirs = [30, 30, 10], [16, 17, 18]
     found = compare(runs("wm_bc", ours), runs("e2e_bc", theirs))
     assert found.interval[0] > 0
     t = ttest_ind([n / 0.4 for n in ours], [n / 0.4 for n in theirs], equal_var=False)
-    assert found.training_interval == pytest.approx(tuple(t.confidence_interval()))
-    assert found.training_interval[0] < 0
-    assert found.verdict == "no difference shown"
+    assert found.seed_interval == pytest.approx(tuple(t.confidence_interval()))
+    assert found.seed_interval[0] < 0
+    assert found.verdict.startswith("no difference")
     steady = compare(runs("wm_bc", [30, 29, 31]), runs("e2e_bc", theirs))
-    assert steady.training_interval[0] > 0
-    assert steady.verdict == "better (intervals exclude zero)"
+    assert steady.seed_interval[0] > 0
+    assert steady.verdict.startswith("better")
     assert compare(runs("e2e_bc", theirs), runs("wm_bc", [30, 29, 31])).verdict.startswith("worse")
-    assert compare(runs("wm_bc", ours), runs("e2e_bc", [17])).training_interval is None
+    assert compare(runs("wm_bc", ours), runs("e2e_bc", [17])).seed_interval is None
 
 
-def test_trainings_on_a_shared_world_model_differ_together() -> None:
+def test_seeds_on_a_shared_world_model_differ_together() -> None:
     """A world model that is good for both arms adds nothing to the spread of their difference."""
     shared = compare(runs("wm_bc", [10, 20, 31]), runs("wm_iql", [8, 18, 28]))
-    assert shared.training_interval == pytest.approx(tuple(ttest_1samp([5, 5, 7.5], 0).confidence_interval()))
-    assert compare(runs("wm_bc", [10, 20, 30]), runs("wm_iql", [8, 18, 28])).training_interval == (5, 5)
+    assert shared.seed_interval == pytest.approx(tuple(ttest_1samp([5, 5, 7.5], 0).confidence_interval()))
+    assert compare(runs("wm_bc", [10, 20, 30]), runs("wm_iql", [8, 18, 28])).seed_interval == (5, 5)
 
 
 def test_only_shared_rollouts_count(make_records: Callable) -> None:
-    """Arms on the same world model share the training of a seed."""
+    """Arms on the same world model share the world model of a seed."""
     ours = make_records("wm_bc", TASKS, seed=0) + make_records("wm_bc", {"reach-v3": (0, 0)}, seed=1)
     theirs = make_records("wm_bc_single", {"reach-v3": (5, 20)}, seed=0)
     found = compare(ours, theirs)
@@ -108,8 +108,8 @@ def test_only_shared_rollouts_count(make_records: Callable) -> None:
     assert compare(ours, make_records("wm_bc_single", TASKS, seed=7)) is None
 
 
-def test_one_training_is_compared_with_every_training_of_the_other(make_records: Callable) -> None:
-    """Of equal number or not: a lucky seed 0 is no better evidence than an unlucky seed 1."""
+def test_each_seed_is_compared_with_each_of_the_other_arm(make_records: Callable) -> None:
+    """Equal numbers or not: a lucky seed 0 is no better evidence than an unlucky seed 1."""
     lucky, unlucky = (
         make_records("wm_bc", {"reach-v3": outcomes}, seed) for seed, outcomes in ((0, (10, 40)), (1, (0, 0)))
     )
@@ -119,11 +119,11 @@ def test_one_training_is_compared_with_every_training_of_the_other(make_records:
         assert (found.n_pairs, found.difference, found.p_value) == (100, 0, None)
         assert (found.only_arm, found.only_other) == (25, 25)
         assert compare(once, lucky + unlucky).difference == 0
-    assert compare(lucky, once).p_value < 0.001, "one training of each: the pairs are independent"
+    assert compare(lucky, once).p_value < 0.001, "one seed of each: the pairs are independent"
 
 
-def test_equal_seeds_of_unrelated_trainings_are_no_pairs(make_records: Callable) -> None:
-    """Two trainings of each: seed 0 of the one has nothing in common with seed 0 of the other."""
+def test_equal_seeds_of_unrelated_arms_are_not_paired(make_records: Callable) -> None:
+    """Two seeds of each: seed 0 of one arm has nothing in common with seed 0 of the other."""
     rng = np.random.default_rng(0)
     ours = [
         with_outcomes(run, rng.random(100) < 0.7) for run in (make_records("wm_bc", TASKS, s) for s in (0, 1))
@@ -139,7 +139,7 @@ def test_equal_seeds_of_unrelated_trainings_are_no_pairs(make_records: Callable)
 
 
 def test_arms_on_a_shared_world_model_are_paired_by_seed(make_records: Callable) -> None:
-    """And the variant with a world model of its own is not among them: its one training meets all of ours."""
+    """The variant with its own world model is not: its one seed is paired with all of ours."""
     ours = [r for seed in (0, 1) for r in make_records("wm_bc", TASKS, seed)]
     assert compare(ours, make_records("wm_iql_beta0", TASKS, 1)).n_pairs == 100
     assert compare(ours, make_records("wm_proprio_bc", TASKS, 1)).n_pairs == 200

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_wm.report.curves import curve_figures, read_logs
+from lerobot_wm.report.training import curve_figures, read_logs
 
 
 def write_log(run: Path, **values: float) -> Path:

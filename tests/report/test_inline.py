@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 from matplotlib.figure import Figure
 
-from lerobot_wm.inspect.html import PNG, SVG, figure_bytes
+from lerobot_wm.inspect.pictures import PNG, SVG, figure_bytes
 from lerobot_wm.report.page import split_figure
 
 

@@ -10,6 +10,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE
 from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.inspect.latent_map import (
     FRAMES_PER_EPISODE,
     LatentMap,
@@ -17,7 +18,6 @@ from lerobot_wm.inspect.latent_map import (
     latent_map,
     task_colours,
 )
-from lerobot_wm.inspect.open_loop import load_world_model
 from lerobot_wm.world_model.rssm import RSSMState
 from tests.report.quality_model import lively_world_model
 

@@ -9,8 +9,8 @@ import torch
 
 from lerobot_wm.constants import OBS_IMAGE
 from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.inspect.quality_dynamics import drift, kl_quality, reward_quality
-from lerobot_wm.inspect.quality_episodes import Episode, Filtered, filter_episodes, read_episodes
+from lerobot_wm.inspect.quality_episodes import Episode, Filtered, filter_episodes, read_demonstrations
+from lerobot_wm.inspect.quality_measures import drift, kl_quality, reward_quality
 from lerobot_wm.world_model.model import WorldModel
 from tests.report.quality_model import lively_world_model
 
@@ -24,7 +24,7 @@ def world_model(world_model_path: Path) -> WorldModel:
 
 @pytest.fixture(scope="module")
 def episodes(demos_root: Path) -> list[Episode]:
-    return read_episodes(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=1, seed=0)
+    return read_demonstrations(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=1, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_kl_statistics(episodes: list[Episode], filtered: list[Filtered]) -> Non
 
 
 @torch.no_grad()
-def test_drift_compares_with_a_filter_that_starts_anew(
+def test_drift_compares_with_a_filter_that_is_restarted(
     world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered]
 ) -> None:
     rows = drift(world_model, episodes[:1], filtered[:1], WINDOW)

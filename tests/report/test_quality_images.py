@@ -9,15 +9,16 @@ import torch
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
 from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.inspect.open_loop import WINDOW, load_world_model, predict
+from lerobot_wm.inspect.episodes import load_world_model
+from lerobot_wm.inspect.open_loop import WINDOW, predict
 from lerobot_wm.inspect.quality_episodes import (
     Episode,
     choose_episodes,
     filter_episodes,
-    read_episodes,
+    read_demonstrations,
     start_positions,
 )
-from lerobot_wm.inspect.quality_open_loop import (
+from lerobot_wm.inspect.quality_measures import (
     PREDICTIONS,
     image_errors,
     mean_and_median_image,
@@ -29,7 +30,7 @@ from tests.report.quality_model import lively_world_model
 
 @pytest.fixture(scope="module")
 def episodes(demos_root: Path) -> list[Episode]:
-    chosen = read_episodes(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=3, seed=0)
+    chosen = read_demonstrations(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=3, seed=0)
     return [episode for episode in chosen if len(episode.actions) >= WINDOW]
 
 
@@ -141,13 +142,17 @@ def test_episodes_are_spread_over_variations() -> None:
 
 
 def test_positions_tell_variations_apart(demos_root: Path) -> None:
-    episodes = read_episodes(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=4, seed=0)
+    episodes = read_demonstrations(
+        SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=4, seed=0
+    )
     names = {(episode.task, episode.variation) for episode in episodes}
     assert len(set(start_positions(episodes))) == len(names)
 
 
 def test_a_dataset_without_positions_is_refused(episodes_root: Path) -> None:
     with pytest.raises(
-        ValueError, match=r"test/episodes has no .*observation\.environment_state.*lerobot-wm collect"
+        ValueError, match=r"test/episodes.*observation\.environment_state.*lerobot-wm collect"
     ):
-        read_episodes(SourceConfig("test/episodes", str(episodes_root)), [OBS_IMAGE], per_task=1, seed=0)
+        read_demonstrations(
+            SourceConfig("test/episodes", str(episodes_root)), [OBS_IMAGE], per_task=1, seed=0
+        )

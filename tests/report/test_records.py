@@ -26,7 +26,7 @@ def test_lists_and_globs(tmp_path: Path) -> None:
 def test_a_repeated_rollout_is_refused(records_file: Path, tmp_path: Path) -> None:
     again = tmp_path / "again.jsonl"
     again.write_text(records_file.read_text().splitlines()[3] + "\n")
-    with pytest.raises(ValueError, match=r"again\.jsonl:1 repeats .*'reach-v3', 3.*records\.jsonl:4"):
+    with pytest.raises(ValueError, match=r"again\.jsonl:1 .*'reach-v3', 3.*records\.jsonl:4"):
         read_records([records_file, again])
 
 
@@ -39,7 +39,7 @@ def test_one_arm_under_two_presets_is_refused(make_records: Callable, tmp_path: 
     assert len(read_records([path])) == 100, "arms may differ in their presets"
     path.write_text("".join(map(record_line, records + other_seed)))
     with pytest.raises(
-        ValueError, match=r"records\.jsonl:51: arm 'wm_bc' has preset 'paper' here, 'test' before"
+        ValueError, match=r"records\.jsonl:51: .*'wm_bc'.*'paper'.*'test'.*records\.jsonl:1\b"
     ):
         read_records([path])
 
@@ -51,7 +51,7 @@ def test_positions_of_different_sets_are_refused(make_records: Callable, tmp_pat
     path.write_text("".join(map(record_line, make_records("wm_bc", {"reach-v3": (1, 1)}) + elsewhere)))
     with pytest.raises(
         ValueError,
-        match=r"records\.jsonl:51: variation 0 of reach-v3 has seen False here, True at .*:1: positions",
+        match=r"records\.jsonl:51: variation 0 of reach-v3 .*seen False.* True .*:1\. .*--env\.variation_set",
     ):
         read_records([path])
 
@@ -86,6 +86,6 @@ def test_positions_of_sets_without_seen_ones_are_told_apart(make_records: Callab
     path.write_text("".join(map(record_line, unseen + arms[43] + arms[44])))
     with pytest.raises(
         ValueError,
-        match=r"records\.jsonl:101: variation 0 of reach-v3 has variation_set 44 here, 43 at .*:51: positions",
+        match=r"records\.jsonl:101: variation 0 of reach-v3 .*variation_set 44.* 43 .*:51\.",
     ):
         read_records([path])

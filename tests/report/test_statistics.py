@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from lerobot_wm.statistics import SuccessRate, ci95_summary, in_split, success_rate
+from lerobot_wm.records import SuccessRate, is_in_split, success_rate
 
 
 def test_wilson_interval_of_the_papers_table() -> None:
@@ -31,14 +31,12 @@ def test_rate_reads_as_counts_percent_and_interval() -> None:
 
 def test_splits(make_records: Callable) -> None:
     records = make_records("wm_bc", {"reach-v3": (4, 15)})
-    assert success_rate(r for r in records if in_split(r, "seen")) == SuccessRate(4, 10)
-    assert success_rate(r for r in records if in_split(r, "unseen")) == SuccessRate(15, 40)
-    assert success_rate(r for r in records if in_split(r, "all")) == SuccessRate(19, 50)
+    assert success_rate(r for r in records if is_in_split(r, "seen")) == SuccessRate(4, 10)
+    assert success_rate(r for r in records if is_in_split(r, "unseen")) == SuccessRate(15, 40)
+    assert success_rate(r for r in records if is_in_split(r, "all")) == SuccessRate(19, 50)
     elsewhere = records[0] | {"seen": None}
-    assert [split for split in ("seen", "unseen", "all") if in_split(elsewhere, split)] == ["all"]
+    assert [split for split in ("seen", "unseen", "all") if is_in_split(elsewhere, split)] == ["all"]
 
 
 def test_no_rollouts_have_no_rate() -> None:
     assert success_rate([]) is None
-    with pytest.raises(ValueError, match="No rollouts"):
-        ci95_summary([])

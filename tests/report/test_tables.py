@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 from rich.console import Console
 
+from lerobot_wm.records import SuccessRate
 from lerobot_wm.report.arms import ARMS
 from lerobot_wm.report.success import comparison_tables, overall_table, paper_comparison, task_table
-from lerobot_wm.statistics import SuccessRate
 from lerobot_wm.tables import ReportTable, markdown_table, table_by_split, terminal_tables
 
 TASKS = {"button-press-topdown-v3": (10, 39), "reach-v3": (4, 15)}

@@ -1,0 +1,36 @@
+"""Figures, pictures and videos as bytes and as data URIs."""
+
+import io
+from base64 import b64encode
+
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+SVG, PNG, WEBP, MP4 = "image/svg+xml", "image/png", "image/webp", "video/mp4"
+MAX_NAME_LENGTH = 32
+
+
+def data_uri(content: bytes, mime_type: str) -> str:
+    """A `src` attribute that holds the content itself, so that one HTML file needs no other."""
+    return f"data:{mime_type};base64,{b64encode(content).decode()}"
+
+
+def shorten(name: str) -> str:
+    """Cut a name so that it leaves room for the figure beside it."""
+    return name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…"
+
+
+def figure_bytes(figure: Figure, mime_type: str) -> bytes:
+    """A matplotlib figure as a PNG or SVG file; the same figure always gives the same bytes."""
+    buffer = io.BytesIO()
+    for text in figure.findobj(Text):
+        # The name of a task or arm may contain $.
+        text.set_parse_math(False)
+    metadata = {"Date": None} if mime_type == SVG else {}
+    figure.savefig(buffer, format="svg" if mime_type == SVG else "png", dpi=100, metadata=metadata)
+    return buffer.getvalue()
+
+
+def figure_uri(figure: Figure, mime_type: str) -> str:
+    """A matplotlib figure as a data URI."""
+    return data_uri(figure_bytes(figure, mime_type), mime_type)

@@ -1,0 +1,201 @@
+"""What the page shows of a world model: dreams of some episodes, and what `lerobot-wm quality` measured."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pandas as pd
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from tqdm import tqdm
+
+from lerobot_wm.constants import TASK
+from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.inspect.dream import Dreams, dream, strip_figure, write_dream
+from lerobot_wm.inspect.episodes import ImaginingPolicy, episodes_by_task, read_episodes
+from lerobot_wm.inspect.open_loop import CONTEXT
+from lerobot_wm.inspect.pictures import MP4, PNG, SVG, data_uri, figure_uri
+from lerobot_wm.inspect.quality_figures import EXAMPLE_HORIZON, EXAMPLES_NAME, quality_figures
+from lerobot_wm.policies.latent.policy import LatentPolicy
+from lerobot_wm.tables import Measurement, ReportTable
+
+# One for each of the first tasks.
+MAX_DREAMS = 3
+# Of an episode; Meta-World's experts need fewer.
+MAX_FRAMES = 120
+
+
+@dataclass(frozen=True)
+class DreamClip:
+    """The dreams of one episode.
+
+    Attributes:
+        task, episode: Which.
+        n_imagined: Imagined steps.
+        kinds: What is shown beside the truth, in order.
+        psnr, copy_psnr: In dB, under true actions and of repeating the last frame seen.
+        video, strip: Data URIs.
+    """
+
+    task: str
+    episode: int
+    n_imagined: int
+    kinds: list[str]
+    psnr: float
+    copy_psnr: float
+    video: str
+    strip: str
+
+
+def dream_clips(
+    policy: ImaginingPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig
+) -> list[DreamClip]:
+    """Dream of the last episode of each of the first tasks; tasks that a policy does not know are left out.
+
+    Args:
+        policy: The world model, or a policy on it, whose own actions are dreamt of too.
+        meta: A dataset that it can read, see `check_features`.
+        source: Where the dataset is.
+    """
+    by_task = episodes_by_task(meta, min_length=CONTEXT + 1)
+    if isinstance(policy, LatentPolicy):
+        by_task = {task: episodes for task, episodes in by_task.items() if task in policy.config.tasks}
+    chosen = sorted(episodes[-1] for episodes in list(by_task.values())[:MAX_DREAMS])
+    if not chosen:
+        return []
+    episodes = read_episodes(policy, meta, source, chosen, MAX_FRAMES)
+    return [
+        _clip(dream(policy, episode, CONTEXT), episode[TASK], index, meta.fps)
+        for index, episode in zip(tqdm(chosen, desc="Dreaming", unit="episode"), episodes, strict=True)
+    ]
+
+
+def _clip(dreams: Dreams, task: str, episode: int, fps: int) -> DreamClip:
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "dream.mp4")
+        write_dream(path, dreams, fps)
+        video = path.read_bytes()
+    return DreamClip(
+        task=task,
+        episode=episode,
+        n_imagined=dreams.n_imagined,
+        kinds=list(dreams.by_actions),
+        psnr=dreams.psnr(),
+        copy_psnr=dreams.copy_psnr(),
+        video=data_uri(video, MP4),
+        strip=figure_uri(strip_figure(dreams), PNG),
+    )
+
+
+def read_quality(path: Path) -> dict[str, Any]:
+    """What the page's section on quality shows: the content of quality.json, its figures and tables.
+
+    Args:
+        path: A quality.json of `lerobot-wm quality`, with the examples' picture beside it.
+
+    Raises:
+        FileNotFoundError: One of the two is missing.
+    """
+    examples = path.with_name(EXAMPLES_NAME)
+    for needed in (path, examples):
+        if not needed.is_file():
+            raise FileNotFoundError(
+                f"{needed} is missing: --quality takes the quality.json that `lerobot-wm quality` wrote, in its folder."
+            )
+    result = json.loads(path.read_text())
+    open_loop = pd.DataFrame(result["open_loop"])
+    return result | {
+        "figures": {name: figure_uri(figure, SVG) for name, figure in quality_figures(result).items()},
+        "examples": data_uri(examples.read_bytes(), PNG),
+        "example_horizon": EXAMPLE_HORIZON,
+        "kl_overall": result["kl"]["tasks"][-1],
+        "open_loop_table": _open_loop_table(open_loop),
+        "foreground_table": _foreground_table(open_loop),
+        "reward_table": _reward_table(result["reward"]) if result["reward"] else None,
+        "probe_tables": _probe_tables(pd.DataFrame(result["probes"])),
+        "kl_table": _kl_table(result["kl"]["tasks"]),
+    }
+
+
+def _open_loop_table(table: pd.DataFrame) -> ReportTable:
+    """Predictions down, horizons across, over all tasks."""
+    overall = table[table["task"] == table["task"].iloc[-1]]
+    rows = [
+        (
+            str(prediction),
+            [
+                Measurement(_number(row.foreground_psnr, 1) or "–", f"{row.psnr:.1f} · {row.ssim:.2f}")
+                for row in group.itertuples()
+            ],
+        )
+        for prediction, group in overall.groupby("prediction", sort=False)
+    ]
+    columns = [f"+{horizon}" for horizon in overall["horizon"].unique()]
+    return ReportTable("Open loop", "prediction", columns, rows)
+
+
+def _foreground_table(table: pd.DataFrame) -> ReportTable:
+    """Tasks down, predictions across: foreground PSNR at EXAMPLE_HORIZON."""
+    chosen = table[table["horizon"] == EXAMPLE_HORIZON]
+    rows = [
+        (str(task), [_number(value, 1) for value in group["foreground_psnr"]])
+        for task, group in chosen.groupby("task", sort=False)
+    ]
+    title = f"Foreground PSNR {EXAMPLE_HORIZON} steps ahead"
+    return ReportTable(title, "task", list(chosen["prediction"].unique()), rows, n_totals=1)
+
+
+def _reward_table(tasks: list[dict[str, Any]]) -> ReportTable:
+    rows = [
+        (
+            row["task"],
+            [
+                f"{100 * row['base_rate']:.1f}%",
+                _number(row["average_precision"], 2),
+                _number(row["auroc"], 3),
+            ],
+        )
+        for row in tasks
+    ]
+    return ReportTable("Reward", "task", ["base rate", "average precision", "AUROC"], rows, n_totals=1)
+
+
+def _probe_tables(table: pd.DataFrame) -> list[ReportTable]:
+    """One table per target: tasks down, representations across."""
+    tables = []
+    for target, group in table.groupby("target", sort=False):
+        rows = [
+            (
+                str(task),
+                [
+                    Measurement(f"{row.median_cm:.1f}", f"{row.mean_cm:.1f} · {row.r2:.2f}")
+                    for row in of_task.itertuples()
+                ],
+            )
+            for task, of_task in group.groupby("task", sort=False)
+        ]
+        columns = list(group["representation"].unique())
+        tables.append(ReportTable(f"Position of the {target}", "task", columns, rows, n_totals=1))
+    return tables
+
+
+def _kl_table(tasks: list[dict[str, Any]]) -> ReportTable:
+    names = list(tasks[0]["percentiles"])
+    rows = [
+        (
+            task["task"],
+            [
+                f"{100 * task['share_under_free_nats']:.0f}%",
+                f"{task['mean']:.1f}",
+                *(f"{task['percentiles'][name]:.1f}" for name in names),
+            ],
+        )
+        for task in tasks
+    ]
+    columns = ["below free nats", "mean", *(f"percentile {name}" for name in names)]
+    return ReportTable("KL", "task", columns, rows, n_totals=1)
+
+
+def _number(value: float | None, digits: int) -> str | None:
+    return None if value is None or pd.isna(value) else f"{value:.{digits}f}"
