@@ -5,8 +5,8 @@
     scripts/reproduce_table1.py --preset=cpu --arms=wm_bc,wm_iql      some arms
     scripts/reproduce_table1.py --preset=cpu --list                   what is finished and what is left
 
-Sizes and training settings are in configs/<preset>.json. If lerobot_wm is not installed for this Python, the script sets
-up the project's own .venv and uses it.
+Sizes and training settings are in configs/<preset>.json. If lerobot_wm is not installed for this Python, the script
+sets up the project's own .venv and uses it.
 """
 
 import importlib.util
