@@ -1,1 +1,1 @@
-"""Speed against the tools people use now: `python -m benchmarks`."""
+"""Speed compared with other tools: `python -m benchmarks`."""

@@ -1,4 +1,4 @@
-"""`python -m benchmarks`: every row side by side with its peers, as a table and as JSON."""
+"""`python -m benchmarks`: measure rows side by side with their peers, print a table, write JSON."""
 
 import argparse
 import json
@@ -23,10 +23,10 @@ SCALES = {"small": 0.1, "normal": 1.0, "large": 10.0}
 
 
 def parse_scale(text: str) -> float:
-    """The factor that `--scale` names.
+    """Return the factor of `--scale`.
 
     Raises:
-        argparse.ArgumentTypeError: It is neither a name nor a positive number.
+        argparse.ArgumentTypeError: The text is neither a name nor a positive number.
     """
     try:
         scale = SCALES[text] if text in SCALES else float(text)
@@ -38,25 +38,25 @@ def parse_scale(text: str) -> float:
 
 
 def parse_rows(text: str) -> list[Row]:
-    """The rows that `--rows` names, in the order of the table.
+    """Return the rows of `--rows`, in the order of the table.
 
     Raises:
-        argparse.ArgumentTypeError: There is no row of a name.
+        argparse.ArgumentTypeError: A row does not exist.
     """
     names = [name.strip() for name in text.split(",")]
     unknown = sorted(set(names) - {row.name for row in ROWS})
     if unknown:
         raise argparse.ArgumentTypeError(
-            f"no row {', '.join(unknown)}; there are {', '.join(row.name for row in ROWS)}."
+            f"unknown row {', '.join(unknown)}; expected some of {', '.join(row.name for row in ROWS)}."
         )
     return [row for row in ROWS if row.name in names]
 
 
 def positive(text: str) -> int:
-    """A whole number of at least 1.
+    """Return a whole number of at least 1.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The text is anything else.
     """
     value = int(text)
     if value < 1:
@@ -65,35 +65,39 @@ def positive(text: str) -> int:
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
-    """The flags; ends with a message where one is wrong."""
+    """Parse the flags; exit with a message if one is wrong."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("--list", action="store_true", help="show rows, sizes and what they need, and stop")
-    parser.add_argument("--rows", type=parse_rows, default=list(ROWS), help="names separated by commas")
+    parser.add_argument(
+        "--list", action="store_true", help="show rows, sizes and needed environments, then exit"
+    )
+    parser.add_argument("--rows", type=parse_rows, default=list(ROWS), help="row names, separated by commas")
     parser.add_argument("--scale", type=parse_scale, default=1.0, help="small, normal, large or a factor")
-    parser.add_argument("--threads", type=positive, default=1, help="of each side's process")
-    parser.add_argument("--repeats", type=positive, default=3, help="of each side, by turns")
+    parser.add_argument("--threads", type=positive, default=1, help="threads of each side's process")
+    parser.add_argument(
+        "--repeats", type=positive, default=3, help="measurements of each side, taken in turns"
+    )
     default = ROOT / "outputs" / "benchmarks" / f"cpu{usable_cores()}.json"
-    parser.add_argument("--output", type=Path, default=default, help="JSON file; rows that are in it stay")
+    parser.add_argument("--output", type=Path, default=default, help="JSON file; other rows in it are kept")
     return parser.parse_args(arguments)
 
 
 def check_machine(path: Path) -> None:
-    """Refuse to put measurements beside those of another processor.
+    """Refuse to mix measurements of two processors in one file.
 
     Raises:
-        SystemExit: The file holds some; names both processors.
+        SystemExit: The file holds measurements of another processor.
     """
     entries = json.loads(path.read_text()) if path.is_file() else []
-    others = {entry["provenance"].get("CPU", "one that was not noted") for entry in entries} - {cpu_kind()}
+    others = {entry["provenance"].get("CPU", "unknown") for entry in entries} - {cpu_kind()}
     if others:
         sys.exit(
-            f"{path} was measured on another processor ({', '.join(others)}; here it is {cpu_kind()}): "
-            "give another --output."
+            f"{path} was measured on another processor ({', '.join(others)}); this is {cpu_kind()}. "
+            "Choose another --output."
         )
 
 
 def write(results: list[Result], path: Path) -> None:
-    """Put results into the file, in place of earlier ones of the same row, size and peer; and its table beside it."""
+    """Add results to the JSON file, replacing those of the same row, size and peer, and rewrite its Markdown table."""
 
     def key(entry: dict[str, Any]) -> tuple[str, str, str | None]:
         return entry["row"], json.dumps(entry["sizes"], sort_keys=True), entry["peer_name"]
@@ -105,7 +109,7 @@ def write(results: list[Result], path: Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print and write; returns the number of rows and sizes that failed."""
+    """Measure, print and write; return how many rows and sizes failed."""
     flags = parse_arguments(arguments)
     console = Console(width=WIDTH)
     if flags.list:
@@ -126,7 +130,7 @@ def main(arguments: list[str]) -> int:
                     failures += 1
                     continue
                 results += [replace(result, provenance=source) for result in measured]
-                write(results, flags.output)  # a run that is interrupted leaves what it has measured
+                write(results, flags.output)  # now, so that an interrupted run keeps what it has measured
     console.print(results_table(results))
     console.print(f"Written: {flags.output}")
     return failures

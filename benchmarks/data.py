@@ -1,4 +1,4 @@
-"""Data and checkpoints of the rows, made by the project's own commands in the run's folder on first use."""
+"""Datasets and checkpoints that the rows need, made on first use with the project's own commands."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ def lerobot_wm(command: str, *flags: str) -> None:
 
 
 def demonstrations(folder: Path, episodes_per_task: int) -> Path:
-    """Root of a dataset of scripted demonstrations of two tasks, 64x64."""
+    """Return the root of a dataset of scripted demonstrations of two tasks with 64x64 images."""
     root = folder / f"demonstrations-{episodes_per_task}"
     if not root.is_dir():
         lerobot_wm(
@@ -28,7 +28,7 @@ def demonstrations(folder: Path, episodes_per_task: int) -> Path:
 
 
 def world_model(folder: Path, dataset: Path) -> Path:
-    """Checkpoint of an untrained world model."""
+    """Return the checkpoint of an untrained world model."""
     output = folder / f"world_model-{dataset.name}"
     if not output.is_dir():
         lerobot_wm("init", "--policy.type=wm_rssm", *dataset_flags(dataset), f"--output_dir={output}")
@@ -36,7 +36,7 @@ def world_model(folder: Path, dataset: Path) -> Path:
 
 
 def latents(folder: Path, episodes_per_task: int) -> tuple[Path, Path]:
-    """Root of the demonstrations' latents, and the checkpoint of the world model they are of."""
+    """Return the root of the demonstrations' latents, and the checkpoint of their world model."""
     dataset = demonstrations(folder, episodes_per_task)
     checkpoint = world_model(folder, dataset)
     root = folder / f"latents-{episodes_per_task}"
@@ -53,5 +53,5 @@ def latents(folder: Path, episodes_per_task: int) -> tuple[Path, Path]:
 
 
 def dataset_flags(root: Path) -> list[str]:
-    """The flags that name a dataset made here."""
+    """Return the flags that name a dataset of this module."""
     return [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]

@@ -1,10 +1,12 @@
-"""Sides measured by turns, each in its own process, and what is said of their values."""
+"""Measure sides in turns, each in its own process, and summarise and write the values."""
 
 import json
 import math
 import os
+import shlex
 import statistics
 import subprocess
+import sys
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -13,20 +15,21 @@ from typing import Any
 
 from benchmarks.environments import ROOT, python_of
 from benchmarks.rows import Row, Side, Size
+from lerobot_wm.records import provenance
 
-LOSS_TOLERANCE = 1e-4  # relative: the same model in another order of additions
-# Fresh weights draw nearly nothing, whatever the layers: it is the gradient that tells two architectures apart.
+LOSS_TOLERANCE = 1e-4  # relative; allows for another order of additions
+# With fresh weights the losses of two architectures hardly differ; the gradient norm does.
 LOSSES = ("loss", "image_loss", "reward_loss", "kl", "gradient_norm")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
 
 
 class SideError(RuntimeError):
-    """A side ended before it answered, or two sides do not compute the same."""
+    """A side ended before it answered, or two sides compute different losses."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Median and range of a side's values, in the row's unit."""
+    """Median and range of a side's values in the row's unit."""
 
     median: float
     low: float
@@ -34,25 +37,25 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Spread":
-        """Of at least one value."""
+        """Summarise at least one value."""
         return cls(statistics.median(values), min(values), max(values))
 
 
 @dataclass(frozen=True)
 class Result:
-    """A row at one size against one peer, in the form of results/benchmarks.
+    """A row at one size against one peer, as it is stored in results/benchmarks.
 
     Attributes:
         row: The row's name.
         ours: Our median.
-        peer: The peer's median; None for a row without one.
-        peer_name: Its name.
+        peer: The peer's median; None for a row without a peer.
+        peer_name: The peer's name.
         ratio: How many times faster ours is.
-        unit: Of `ours` and `peer`.
+        unit: Unit of `ours` and `peer`.
         sizes: Parameters of the row and the number of threads.
-        repeats: Values of each side.
+        repeats: Number of values of each side.
         spread: The lowest and highest value of each side.
-        facts: What each side says of itself.
+        facts: What each side reports about itself, such as its losses.
         provenance: The command, versions and machine.
     """
 
@@ -70,12 +73,12 @@ class Result:
 
 
 def speed_up(ours: float, peer: float, less_is_better: bool) -> float:
-    """How many times faster ours is, from values in one unit."""
+    """Return how many times faster ours is; both values have the same unit."""
     return peer / ours if less_is_better else ours / peer
 
 
 class SideProcess:
-    """A side running `benchmarks.side`, prepared and waiting to be asked."""
+    """A process that runs `benchmarks.side`, prepared and ready to measure."""
 
     def __init__(self, side: Side, row: Row, size: Size, folder: Path, threads: int) -> None:
         self._side = side
@@ -104,12 +107,12 @@ class SideProcess:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._process.communicate()  # closes its standard input, which ends it
+        self._process.communicate()  # closes its standard input, which ends the process
 
     def measure(self) -> float:
-        """One value."""
+        """Measure once."""
         assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # it ended meanwhile, and gives no answer
+        with suppress(BrokenPipeError):  # it has ended; reading the answer then fails
             self._process.stdin.write("measure\n")
             self._process.stdin.flush()
         return self._answer()
@@ -124,21 +127,21 @@ class SideProcess:
 
 
 def measure_row(row: Row, size: Size, folder: Path, threads: int, repeats: int) -> list[Result]:
-    """One row at one size: a result for each peer, or one for a row without peers.
+    """Measure a row at one size; return a result for each peer, or one if there is no peer.
 
     Args:
         row: What to measure.
         size: One of its sizes, scaled.
-        folder: Where sides put their data; sides of all rows find there what others made.
+        folder: Folder for the data of the sides, shared by all rows.
         threads: Threads of each side's process.
-        repeats: How many times each side is measured, by turns.
+        repeats: How often each side is measured; the sides take turns.
 
     Raises:
-        SideError: A side failed, or the sides do not compute the same.
+        SideError: A side failed, or the sides compute different losses.
     """
     sides = (row.ours, *row.peers)
     with ExitStack() as running:
-        # One after the other: ours first, whose data and weights a peer reads.
+        # Ours starts first because peers read its data and weights.
         processes = [running.enter_context(SideProcess(side, row, size, folder, threads)) for side in sides]
         facts = {side.name: process.facts for side, process in zip(sides, processes, strict=True)}
         check_losses(facts)
@@ -170,21 +173,30 @@ def measure_row(row: Row, size: Size, folder: Path, threads: int, repeats: int) 
 
 
 def check_losses(facts: dict[str, dict[str, Any]]) -> None:
-    """Refuse to compare sides that report losses, or parts of them, which differ.
+    """Check that all sides report the same losses.
 
     Args:
-        facts: Of each side, by its name; what a side does not report is not compared.
+        facts: Facts of each side by name; losses that a side does not report are not compared.
 
     Raises:
-        SideError: Names the part and both values.
+        SideError: A loss differs by more than the tolerance.
     """
     for part in LOSSES:
         values = {name: fact[part] for name, fact in facts.items() if part in fact}
         if values and not math.isclose(*_ends(values.values()), rel_tol=LOSS_TOLERANCE):
             raise SideError(
-                f"The sides compute different values of {part} from the same weights and batch: {values}; expected a "
-                f"relative difference of at most {LOSS_TOLERANCE:g}. Their times cannot be compared."
+                f"The sides compute different values of {part} from the same weights and batch: {values}. Expected a "
+                f"relative difference of at most {LOSS_TOLERANCE:g}, so their times cannot be compared."
             )
+
+
+def write_rows(module: str, rows: list[dict[str, Any]], output: Path | None) -> None:
+    """Print the rows of a module's command with their provenance as JSON, and write them to `output` if given."""
+    source = {**provenance(), "command": f"python -m {module} {shlex.join(sys.argv[1:])}"}
+    text = json.dumps({"provenance": source, "rows": rows}, indent=2)
+    print(text)
+    if output is not None:
+        output.write_text(text + "\n")
 
 
 def _ends(values: Collection[float]) -> tuple[float, float]:

@@ -1,16 +1,13 @@
-"""Peak memory of world-model training, and what it costs to read frames from a memory map instead of from RAM.
+"""Peak memory of world-model training, and the cost of reading frames from a memory map.
 
     python -m benchmarks.memory --gigabytes=8 --output=memory.json
 
-The data is a real LeRobotDataset of synthetic videos, 100-frame episodes of 64x64 images, whose decoded frames take
-as much as asked for: it needs twice that in free memory, and a little more than that on the disk of $TMPDIR.
-Prints one JSON document: `provenance` and `rows` in the form of results/benchmarks.
+The data is a LeRobotDataset of synthetic videos: episodes of 100 frames with 64x64 pixels. --gigabytes sets the size of
+the decoded frames. This needs twice that much free memory, and slightly more than that much disk space in $TMPDIR.
 """
 
 import argparse
-import json
 import os
-import shlex
 import statistics
 import subprocess
 import sys
@@ -29,23 +26,23 @@ from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import BatchSampler
 
+from benchmarks.measure import write_rows
 from lerobot_wm.collect.merge import merge_datasets
 from lerobot_wm.constants import FPS, OBS_IMAGE
 from lerobot_wm.data.cache import CACHE_VARIABLE, cache_root
 from lerobot_wm.data.loader import RamDataset
 from lerobot_wm.data.schema import metaworld_features
-from lerobot_wm.records import provenance
 
-SIZE, LENGTH, EPISODES = 64, 100, 20  # pixels, frames of an episode, episodes of the piece that is repeated
+SIZE, LENGTH, EPISODES = 64, 100, 20  # pixels, frames per episode, episodes per repeated piece
 PIECE_BYTES = EPISODES * LENGTH * SIZE * SIZE * 3
 BATCH, WINDOW = 16, 25
-STEPS, BATCHES, REPEATS = 20, 256, 5  # training steps; batches read for one speed; how often
-BOUND_GB = 2.5  # training may take this much beside the frames
+STEPS, BATCHES, REPEATS = 20, 256, 5  # training steps; batches per speed measurement; measurements
+BOUND_GB = 2.5  # allowed memory of training in addition to the frames
 REPO = "benchmark/memory"
 
 
 def write_piece(root: Path) -> None:
-    """A dataset of a few episodes: a disc that moves over a gradient, and random numbers in the columns."""
+    """Write a dataset of a few episodes: a disc moving over a gradient, and random numbers in all columns."""
     features = metaworld_features(SIZE, [OBS_IMAGE])
     dataset = LeRobotDataset.create(
         REPO, FPS, features, root=root, rgb_encoder=RGBEncoderConfig(vcodec="h264")
@@ -67,7 +64,7 @@ def write_piece(root: Path) -> None:
 
 
 def make_dataset(folder: Path, gigabytes: float) -> Path:
-    """A LeRobotDataset whose decoded frames take about this much; returns its root."""
+    """Write a LeRobotDataset whose decoded frames have about this size; return its root."""
     write_piece(folder / "piece")
     pieces = max(1, round(gigabytes * 1e9 / PIECE_BYTES))
     merge_datasets([folder / "piece"] * pieces, REPO, folder / "dataset")
@@ -75,11 +72,11 @@ def make_dataset(folder: Path, gigabytes: float) -> Path:
 
 
 def training_peak(root: Path, output_dir: Path) -> dict[str, float]:
-    """Peak memory in GB of `lerobot-wm train --policy.type=wm_rssm` on a dataset that is not decoded yet.
+    """Measure the peak memory in GB of `lerobot-wm train --policy.type=wm_rssm`, decoding of the dataset included.
 
     Returns:
-        `peak` as the kernel counts it, pages of mapped files included; `private` leaves those out, which other
-        processes share and the kernel takes back at will.
+        `peak` includes pages of mapped files. `private` excludes them: the kernel can reclaim them, and processes
+        share them.
     """
     command = [
         *(sys.executable, "-m", "lerobot_wm.cli", "train", "--policy.type=wm_rssm", "--policy.device=cpu"),
@@ -97,25 +94,25 @@ def training_peak(root: Path, output_dir: Path) -> dict[str, float]:
         private = max(private, memory.rss - memory.shared)
         time.sleep(0.05)
     if status:
-        raise RuntimeError(f"{' '.join(command)} failed: its own message is above.")
+        raise RuntimeError(f"{' '.join(command)} failed. Its message is above.")
     return {"peak": usage.ru_maxrss * 1024 / 1e9, "private": private / 1e9}
 
 
 def frames_file(root: Path) -> Path:
-    """The file that holds a dataset's decoded frames."""
+    """Return the file with a dataset's decoded frames."""
     [path] = cache_root(root).glob(f"frames-*/{OBS_IMAGE}.npy")
     return path
 
 
 class ResidentDataset(RamDataset):
-    """The same, with the frames copied into the process's own memory."""
+    """A RamDataset with the frames copied into the process's own memory."""
 
     def _fit_on_device(self) -> bool:
         return True
 
 
 def windows_per_second(source: RamDataset, batches: Iterable[list[int]]) -> float:
-    """Speed of assembling batches of windows."""
+    """Measure the speed of assembling batches of windows."""
     start = time.perf_counter()
     for rows in islice(batches, BATCHES):
         source.batch(rows)
@@ -123,7 +120,7 @@ def windows_per_second(source: RamDataset, batches: Iterable[list[int]]) -> floa
 
 
 def set_cached(path: Path, cached: bool) -> None:
-    """Bring a file into the page cache, or out of it (it must not be mapped then)."""
+    """Load a file into the page cache, or drop it from there (then it must not be mapped)."""
     with path.open("rb", buffering=0) as file:
         if cached:
             chunk = bytearray(1 << 24)
@@ -135,9 +132,9 @@ def set_cached(path: Path, cached: bool) -> None:
 
 
 def reading_speeds(root: Path) -> dict[str, list[float]]:
-    """Windows per second from RAM, from a memory map whose pages are cached, and from one whose pages are on disk.
+    """Measure windows per second from RAM, from a cached memory map, and from a memory map on disk.
 
-    The three alternate, each memory map is a new one, and all read the same windows in the order of a training.
+    The three take turns with new memory maps, and read the same windows in the same shuffled order.
     """
     deltas = {key: [t / FPS for t in range(WINDOW)] for key in (OBS_IMAGE, "action", "next.reward")}
     dataset = LeRobotDataset(REPO, root=root, delta_timestamps=deltas, return_uint8=True)
@@ -162,7 +159,7 @@ def reading_speeds(root: Path) -> dict[str, list[float]]:
 
 
 def measure(folder: Path, gigabytes: float) -> list[dict[str, Any]]:
-    """Make the data in `folder` and measure every row, in the form of results/benchmarks."""
+    """Make the data in `folder` and measure every row."""
     root = make_dataset(folder, gigabytes)
     peak = training_peak(root, folder / "run")
     speeds = reading_speeds(root)
@@ -193,28 +190,24 @@ def measure(folder: Path, gigabytes: float) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Measure and write all rows."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--gigabytes", type=float, default=8.0, help="size of the decoded frames")
-    parser.add_argument("--output", type=Path, help="write the JSON here, too")
+    parser.add_argument("--output", type=Path, help="JSON file to write")
     args = parser.parse_args()
     needed, free = 2 * args.gigabytes, psutil.virtual_memory().available / 1e9
     if free < needed:
         sys.exit(
-            f"{free:.1f} GB of memory are free, and --gigabytes={args.gigabytes:g} needs {needed:g}, the frames in the "
-            "page cache and in RAM: give fewer --gigabytes."
+            f"--gigabytes={args.gigabytes:g} needs {needed:g} GB of free memory for the frames in the page cache and "
+            f"in RAM, but {free:.1f} GB are free. Choose fewer --gigabytes."
         )
     torch.set_num_threads(1)
-    os.environ.pop(CACHE_VARIABLE, None)  # frames lie beside the data, and go with it
+    os.environ.pop(CACHE_VARIABLE, None)  # cached frames are then deleted with the data
     with tempfile.TemporaryDirectory() as folder:
         rows = measure(Path(folder), args.gigabytes)
-    source = {**provenance(), "command": f"python -m benchmarks.memory {shlex.join(sys.argv[1:])}"}
-    text = json.dumps({"provenance": source, "rows": rows}, indent=2)
-    print(text)
-    if args.output is not None:
-        args.output.write_text(text + "\n")
+    write_rows("benchmarks.memory", rows, args.output)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Untrained policies for the rows that time decisions and rollouts: speed does not depend on the weights."""
+"""Untrained policies for the rows that time decisions and rollouts; speed does not depend on the weights."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from lerobot_wm.world_model.config import RSSMConfig
 
 
 def input_features(image_size: int) -> dict[str, PolicyFeature]:
-    """One camera and proprioception."""
+    """Return the features of one camera and proprioception."""
     return {
         OBS_IMAGE: PolicyFeature(type=FeatureType.VISUAL, shape=(3, image_size, image_size)),
         OBS_STATE: PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,)),
@@ -21,12 +21,12 @@ def input_features(image_size: int) -> dict[str, PolicyFeature]:
 
 
 def output_features() -> dict[str, PolicyFeature]:
-    """Meta-World's action."""
+    """Return the feature of Meta-World's action."""
     return {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))}
 
 
 def wm_bc(image_size: int) -> WMBCPolicy:
-    """wm_bc with its world model for the six tasks; images of another size than 64x64 are scaled down by it."""
+    """Make a wm_bc with its world model for the six tasks; it scales images of other sizes to 64x64."""
     common: dict[str, Any] = {
         "device": "cpu",
         "push_to_hub": False,

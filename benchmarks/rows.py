@@ -1,4 +1,4 @@
-"""What is measured: every row with its sides and its three sizes."""
+"""All rows of the benchmark with their sides and three sizes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ Size = dict[str, float]
 
 @dataclass(frozen=True)
 class Side:
-    """One of those that are compared.
+    """One of the programs that a row compares.
 
     Attributes:
-        name: As tables call it.
-        function: `module:function`; it is called with a folder and the row's size.
-        environment: Where it runs: the project's own environment, or a peer's.
+        name: Name in the tables.
+        function: `module:function`, called with a folder and the row's size.
+        environment: The environment it runs in, the project's own or a peer's.
     """
 
     name: str
@@ -28,15 +28,15 @@ class Row:
     """A comparison.
 
     Attributes:
-        name: As in `--rows`.
-        title: What a value of the row is.
-        unit: Its unit.
+        name: Name for `--rows`.
+        title: What is measured.
+        unit: Unit of the values.
         ours: Our side.
-        peers: Whom it is compared with; none where there is nobody.
-        sizes: Three sets of arguments of the sides, in growing order.
-        scaled: Which of them `--scale` multiplies.
+        peers: The sides to compare with; may be empty.
+        sizes: Three sets of arguments for the sides, in increasing order.
+        scaled: The arguments that `--scale` multiplies.
         variables: Environment variables of all sides.
-        less_is_better: The values are durations.
+        less_is_better: Whether the values are durations.
     """
 
     name: str
@@ -50,9 +50,9 @@ class Row:
     less_is_better: bool = False
 
     def scaled_sizes(self, scale: float) -> list[Size]:
-        """The sizes with the arguments in `scaled` multiplied; counts stay whole and at least 1.
+        """Multiply the arguments in `scaled`; counts stay whole and at least 1.
 
-        At a small scale sizes can become equal; each is there once.
+        Sizes that become equal at a small scale are merged.
         """
 
         def scaled(name: str, value: float) -> float:
@@ -65,12 +65,12 @@ class Row:
 
 
 def _sizes(name: str, values: tuple[float, float, float], **common: float) -> tuple[Size, Size, Size]:
-    """Three sizes that differ in one argument."""
+    """Make three sizes that differ in one argument."""
     small, middle, large = ({name: value, **common} for value in values)
     return small, middle, large
 
 
-# glibc: keep what was freed instead of giving it back to the system and clearing new pages for the next step.
+# glibc keeps freed memory instead of returning it to the system and clearing new pages in the next step.
 KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**30)}
 
 

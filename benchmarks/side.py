@@ -1,7 +1,7 @@
-"""One side of a row in a process of its own: `python -m benchmarks.side MODULE:FUNCTION SIZE_AS_JSON FOLDER`.
+"""Run one side of a row: `python -m benchmarks.side MODULE:FUNCTION SIZE_AS_JSON FOLDER`.
 
-It calls `FUNCTION(folder, **size)`, writes the facts it is given as a line of JSON, and then a
-line with one value for every line it reads. What libraries print goes to standard error.
+Calls `FUNCTION(folder, **size)` and prints its facts as one line of JSON. Then it measures once for every line that it
+reads, and prints the value. Output of libraries goes to standard error.
 """
 
 import importlib
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def main() -> None:
-    """Prepare the side, then answer until standard input is closed."""
+    """Prepare the side, then measure on request until standard input is closed."""
     target, size, folder = sys.argv[1:]
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

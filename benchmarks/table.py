@@ -1,4 +1,4 @@
-"""Rows and results as tables: of 100 columns, and in Markdown."""
+"""Tables of rows and results, for the terminal and in Markdown."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -13,7 +13,7 @@ WIDTH = 100
 
 
 def number(value: float) -> str:
-    """Three significant digits, without an exponent."""
+    """Format a value with three significant digits and without an exponent."""
     if value == 0:
         return "0"
     if abs(value) >= 100:
@@ -22,13 +22,13 @@ def number(value: float) -> str:
 
 
 def size_text(size: Size) -> str:
-    """`batch 16, length 25`."""
+    """Format a size, such as `batch 16, length 25`."""
     return ", ".join(f"{name.replace('_', ' ')} {value:g}" for name, value in size.items())
 
 
 def results_table(results: Iterable[Result]) -> Table:
-    """Medians with their ranges, and how many times faster ours is; every row at its sizes."""
-    table = Table(width=WIDTH, title="Median, and lowest and highest value below it")
+    """Make a table of medians, ranges and ratios."""
+    table = Table(width=WIDTH, title="Median, with the lowest and highest value below")
     for title in ("row", "size", "against"):
         table.add_column(title, overflow="fold")
     for title in ("ours", "peer", "times faster"):
@@ -49,11 +49,11 @@ def results_table(results: Iterable[Result]) -> Table:
 
 
 def markdown_table(entries: Iterable[Mapping[str, Any]]) -> str:
-    """The entries of a results file (`Result` as dicts), in the order of the rows, one line each."""
+    """Format the entries of a results file (`Result` as dicts), one line each, in the order of the rows."""
     titles = {row.name: row.title for row in ROWS}
     order = list(titles)
     lines = ["| row | size | against | ours | peer | times faster |", "|---|---|---|---:|---:|---:|"]
-    # A row that is measured no longer is called what it was called, and comes last.
+    # Entries of rows that no longer exist keep their name and come last.
     for entry in sorted(entries, key=lambda e: order.index(e["row"]) if e["row"] in titles else len(order)):
         title = f"{titles.get(entry['row'], entry['row'])}; {entry['unit']}"
         peer, ratio = "", ""
@@ -66,7 +66,7 @@ def markdown_table(entries: Iterable[Mapping[str, Any]]) -> str:
 
 
 def rows_table(rows: Iterable[Row], scale: float) -> Table:
-    """What can be measured, at which sizes, and the environment each peer needs."""
+    """Make a table of the rows, their sizes, and the environment each peer needs."""
     table = Table(width=WIDTH)
     for title in ("row", "what", "sizes", "against (needs)"):
         table.add_column(title, overflow="fold")

@@ -1,4 +1,4 @@
-"""What every side shares. It imports nothing but Python's own library: peers' environments have nothing of ours."""
+"""Timing for all sides. Imports only the standard library, because peers' environments lack our packages."""
 
 import time
 from collections.abc import Callable
@@ -10,8 +10,8 @@ class Prepared:
     """A side that is ready to be timed.
 
     Attributes:
-        measure: Runs once and returns one value in the row's unit.
-        facts: What the side says of itself, such as the loss it computes; kept beside the result.
+        measure: Measures once and returns a value in the row's unit.
+        facts: What the side reports about itself, such as its loss; stored with the result.
     """
 
     measure: Callable[[], float]
@@ -19,7 +19,7 @@ class Prepared:
 
 
 def rate(step: Callable[[], int], seconds: float) -> float:
-    """Repeat `step`, which returns how many units it did, for some seconds, at least once; units per second."""
+    """Repeat `step`, which returns a number of units, for some seconds and at least once; return units per second."""
     units = 0
     start = time.perf_counter()
     while True:
@@ -30,7 +30,7 @@ def rate(step: Callable[[], int], seconds: float) -> float:
 
 
 def timed_updates(update: Callable[[], object], seconds: float, facts: dict[str, float | str]) -> Prepared:
-    """A side whose unit is one update; the first ones, slower than the rest, are not timed."""
+    """Make a side that counts updates; two slow first updates are not timed."""
 
     def step() -> int:
         update()

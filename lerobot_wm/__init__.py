@@ -13,4 +13,4 @@ from lerobot_wm.policies.wm_bc import configuration_wm_bc as _wm_bc  # noqa: F40
 from lerobot_wm.policies.wm_iql import configuration_wm_iql as _wm_iql  # noqa: F401
 from lerobot_wm.policies.wm_rssm import configuration_wm_rssm as _wm_rssm  # noqa: F401
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"

@@ -1,6 +1,6 @@
-"""Names stated once: feature keys, task sets, camera and protocol numbers."""
+"""Names and numbers used in several places: feature keys, task sets, camera, evaluation protocol."""
 
-# Feature keys, equal to LeRobot's (this module imports nothing, so that nn/, world_model/ and rl/ can use it).
+# Feature keys, equal to LeRobot's. This module imports nothing, so that nn/, world_model/ and rl/ can use it.
 OBS_IMAGE = "observation.image"
 OBS_IMAGES = "observation.images"
 OBS_STATE = "observation.state"
@@ -39,15 +39,14 @@ MT10: tuple[str, ...] = (
     "window-close-v3",
 )
 
-# A task set's name on the command line -> its tasks; "mt50" is every task and is resolved in envs/tasks.py.
+# Name of a task set on the command line -> its tasks. "mt50", all tasks, is resolved in envs/tasks.py.
 TASK_SETS: dict[str, tuple[str, ...]] = {"mt6": MT6, "mt10": MT10}
 
 ENV_TYPE = "metaworld_mt"
 NUM_VARIATIONS = 50
-NUM_SEEN_VARIATIONS = 10  # variations 0-9 are collected on, 10-49 are never seen in training
-# Sets of fixed variations, named by the seed given to metaworld.MT1. The table is measured on the first; the second,
-# other positions of the same objects, is for choosing settings and for probes; the third is for settings that are
-# final, once, when the table's positions have been looked at before.
+NUM_SEEN_VARIATIONS = 10  # demonstrations show variations 0-9; 10-49 are never seen in training
+# Sets of fixed variations, named by the seed given to metaworld.MT1: other positions of the same objects. Results are
+# reported on the first, settings are tuned on the second, and the third confirms final settings once.
 REPORTED_VARIATION_SET = 42
 SELECTION_VARIATION_SET = 43
 CONFIRMATION_VARIATION_SET = 44
@@ -60,7 +59,7 @@ ENV_STATE_DIM = 39
 IMAGE_SIZE = 64
 ROBOT_TYPE = "metaworld"
 
-# The default camera, LeRobot's adjusted corner2: it shows every task's objects.
+# The default camera is LeRobot's adjusted corner2, which shows the objects of every task.
 CAMERA_NAME = "corner2"
 CAMERA_POSITION = (0.75, 0.075, 0.7)
 

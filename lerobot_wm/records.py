@@ -1,5 +1,6 @@
 """Records: one JSON line per rollout, written by `lerobot-wm eval` and read by `lerobot-wm report`."""
 
+import gzip
 import json
 import platform
 import shlex
@@ -58,7 +59,7 @@ def find_records(patterns: str) -> list[Path]:
 
 
 def read_records(paths: Iterable[Path]) -> list[Record]:
-    """All records of the files, in order.
+    """All records of the files, in order; files named .gz are compressed.
 
     Raises:
         ValueError: when a line is not a record, when a rollout occurs twice, when one arm has two presets, when a
@@ -69,7 +70,7 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
     presets: dict[str, str] = {}
     positions: dict[tuple[str, int, str], tuple[Any, str]] = {}
     for path in paths:
-        for number, line in enumerate(path.read_text().splitlines(), start=1):
+        for number, line in enumerate(_lines(path), start=1):
             record = _parse(line, where=f"{path}:{number}")
             rollout = (record["arm"], record["seed"], record["task"], record["variation"])
             if rollout in origins:
@@ -101,6 +102,11 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
     if not records:
         raise ValueError("The records files are empty: run `lerobot-wm eval` first.")
     return records
+
+
+def _lines(path: Path) -> list[str]:
+    data = path.read_bytes()
+    return (gzip.decompress(data) if path.suffix == ".gz" else data).decode().splitlines()
 
 
 def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:

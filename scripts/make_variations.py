@@ -1,8 +1,8 @@
-"""Regenerate lerobot_wm/envs/variations.json: the fixed variations of each Meta-World task, 50 in each set.
+"""Write lerobot_wm/envs/variations.json: 50 fixed variations of each Meta-World task for each variation set.
 
-    python scripts/make_variations.py        (two minutes)
+    python scripts/make_variations.py
 
-Prints the file's SHA-256, which belongs in lerobot_wm/envs/variations.py.
+Takes two minutes. Prints the SHA-256 of the file, to be copied to lerobot_wm/envs/variations.py.
 """
 
 import hashlib
@@ -18,13 +18,13 @@ from lerobot_wm.envs.variations import VARIATIONS_PATH
 
 
 def rand_vecs(task: str, seed: int) -> list[list[float]]:
-    """The 50 vectors that `metaworld.MT1(task, seed)` draws for its training tasks."""
+    """Return the 50 vectors that `metaworld.MT1(task, seed)` draws for its training tasks."""
     train_tasks = metaworld.MT1(task, seed=seed).train_tasks
     return [pickle.loads(train_task.data)["rand_vec"].tolist() for train_task in train_tasks]
 
 
 def set_text(seed: int) -> str:
-    """One set as JSON, a task per line so that a change is readable in a diff."""
+    """Format one set as JSON, one task per line to keep diffs readable."""
     lines = [
         f'"{task}": {json.dumps(rand_vecs(task, seed))}' for task in tqdm(all_tasks(), desc=f"set {seed}")
     ]

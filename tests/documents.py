@@ -1,4 +1,4 @@
-"""The commands and programs in README and docs, as tests run them."""
+"""What tests read in README and docs: commands, programs and tables."""
 
 import re
 import shlex
@@ -26,3 +26,25 @@ def with_flags(words: list[str], **flags: object) -> list[str]:
         assert len(places) == 1, f"{' '.join(words)} has no --{name}"
         words = [*words[: places[0]], f"--{name}={value}", *words[places[0] + 1 :]]
     return words
+
+
+def documents() -> list[str]:
+    """Every document that a reader is led to, named from the repository's root."""
+    return [
+        "README.md",
+        "CONTRIBUTING.md",
+        *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
+    ]
+
+
+def tables(document: str, heading: str) -> list[list[dict[str, str]]]:
+    """The tables under a heading, up to the next heading of its level; each row by the column's title."""
+    level = heading.split()[0]
+    [_, after] = f"\n{(ROOT / document).read_text()}".split(f"\n{heading}\n")
+    section = re.split(rf"^{level} ", after, flags=re.MULTILINE)[0]
+    found = []
+    for block in re.findall(r"(?:^ *\|.*\n)+", section, re.MULTILINE):
+        lines = [re.split(r"(?<!\\)\|", line.strip())[1:-1] for line in block.splitlines()]
+        title, _, *rows = [[cell.strip() for cell in cells] for cells in lines]
+        found.append([dict(zip(title, row, strict=True)) for row in rows])
+    return found

@@ -1,5 +1,6 @@
 """From stages to records: finished arms are recorded once, failed ones are named, committed ones do not run."""
 
+import gzip
 import io
 import json
 import sys
@@ -88,7 +89,9 @@ def committed(tmp_path: Path) -> Path:
     """A folder where wm_bc's records are committed and its outputs are gone."""
     run(tmp_path, [("wm_bc", 0)])
     (tmp_path / "results").mkdir()
-    (tmp_path / "outputs" / "own_records.jsonl").rename(tmp_path / "results" / "records.jsonl")
+    own = tmp_path / "outputs" / "own_records.jsonl"
+    (tmp_path / "results" / "records.jsonl.gz").write_bytes(gzip.compress(own.read_bytes()))
+    own.unlink()
     (tmp_path / "outputs" / "wm_bc_0" / "done").unlink()
     return tmp_path
 
@@ -107,7 +110,7 @@ def test_arms_whose_records_are_committed_are_named(committed: Path) -> None:
         arms.name_committed(Console(file=file, width=200))
         file.seek(0)
         printed = file.read().replace("\n", "")
-    for fact in (str(committed / "results" / "records.jsonl"), "wm_bc 0", "--results_dir"):
+    for fact in (str(committed / "results" / "records.jsonl.gz"), "wm_bc 0", "--results_dir"):
         assert fact in printed
     assert "wm_bc 1" not in printed
 

@@ -23,7 +23,7 @@ LEVELS = {
     for level, names in enumerate(
         (
             ("constants", "files", "system"),
-            ("records", "statistics", "tables", "errors", "workers", "quiet", "nn"),
+            ("records", "statistics", "tables", "errors", "workers", "quiet", "markdown", "nn"),
             ("world_model", "rl"),
             ("data", "envs"),
             ("policies",),

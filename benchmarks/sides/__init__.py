@@ -1,1 +1,1 @@
-"""What is timed: a function for each side of each row, called in a process of its own by `benchmarks.side`."""
+"""The functions that are timed, one for each side of each row; `benchmarks.side` calls them in their own process."""

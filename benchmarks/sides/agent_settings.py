@@ -1,4 +1,4 @@
-"""Sizes and settings of the peers' IQL and BC: those of `wm_iql` and `wm_bc`, which their environments lack."""
+"""Settings of the peers' IQL and BC, equal to those of `wm_iql` and `wm_bc`."""
 
 OBSERVATION_DIM = 512 + 6 + 4  # latent, one-hot task, proprioception
 ACTION_DIM = 4

@@ -1,4 +1,4 @@
-"""One update of our IQL and BC heads on a batch that is in memory."""
+"""Updates of our IQL and BC heads on a batch in memory."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +17,7 @@ from lerobot_wm.rl.bc import bc_loss
 
 
 def iql(folder: Path, batch: int, seconds: float) -> Prepared:
-    """Updates per second of the IQL agent with the settings of `wm_iql`, its target networks included."""
+    """Time updates of the IQL agent of `wm_iql`, target networks included."""
     torch.manual_seed(0)
     config = WMIQLConfig(device="cpu")
     agent = IQLAgent(
@@ -49,7 +49,7 @@ def iql(folder: Path, batch: int, seconds: float) -> Prepared:
 
 
 def bc(folder: Path, batch: int, seconds: float) -> Prepared:
-    """Updates per second of the regression of `wm_bc`."""
+    """Time updates of the regression of `wm_bc`."""
     torch.manual_seed(0)
     config = WMBCConfig(device="cpu")
     actor = MLP(OBSERVATION_DIM, config.hidden_dims, ACTION_DIM, torch.nn.ReLU, config.dropout)

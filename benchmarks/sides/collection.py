@@ -9,7 +9,7 @@ from lerobot_wm.constants import MT6
 
 
 def ours(folder: Path, episodes_per_task: int, workers: int) -> Prepared:
-    """Episodes per minute of `lerobot-wm collect` on the six tasks."""
+    """Measure episodes per minute of `lerobot-wm collect` on the six tasks."""
     command = [
         *("lerobot_wm.cli", "collect", "--tasks=mt6", f"--repo_id={REPO_ID}"),
         *(f"--episodes_per_task={episodes_per_task}", f"--num_workers={workers}"),

@@ -1,4 +1,4 @@
-"""A whole command by the clock."""
+"""Time whole commands."""
 
 import subprocess
 import sys
@@ -10,13 +10,13 @@ from benchmarks.timing import Prepared
 
 
 def per_minute(command: list[str], output_flag: str, folder: Path, units: int) -> Prepared:
-    """Units of work per minute of a `python -m` command, its start-up included.
+    """Measure units of work per minute of a `python -m` command, start-up included.
 
     Args:
         command: The module and its flags.
-        output_flag: The flag that names the folder it writes to, a new one each time.
-        folder: Where these are made.
-        units: How many units the command does.
+        output_flag: The flag for the output folder, which is new each time.
+        folder: Parent of the output folders.
+        units: Units of work that the command does.
     """
 
     def measure() -> float:

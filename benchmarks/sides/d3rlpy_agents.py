@@ -1,4 +1,4 @@
-"""One update of d3rlpy's IQL and BC with our networks' sizes and settings, from a batch that is in memory."""
+"""Updates of d3rlpy's IQL and BC with our network sizes and settings, on a batch in memory."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from benchmarks.timing import Prepared, timed_updates
 
 
 def iql(folder: Path, batch: int, seconds: float) -> Prepared:
-    """Updates per second, target networks included."""
+    """Time updates of IQL, target networks included."""
     network = VectorEncoderFactory(hidden_units=HIDDEN_DIMS)
     config = IQLConfig(
         actor_learning_rate=LEARNING_RATE,
@@ -42,7 +42,7 @@ def iql(folder: Path, batch: int, seconds: float) -> Prepared:
 
 
 def bc(folder: Path, batch: int, seconds: float) -> Prepared:
-    """Updates per second."""
+    """Time updates of BC."""
     config = BCConfig(
         batch_size=batch,
         learning_rate=LEARNING_RATE,

@@ -1,4 +1,4 @@
-"""What the two sides of the world-model rows share: weights, a batch, and noise that is the same on both."""
+"""Shared by both sides of the world-model rows: weights, a batch, and the same noise."""
 
 from pathlib import Path
 
@@ -7,10 +7,10 @@ from torch import Tensor
 
 
 def batch_file(folder: Path, batch: int, length: int) -> Path:
-    """Where our side leaves its weights and batch, and the peer finds them."""
+    """Return the file in which our side saves its weights and batch for the peer."""
     return folder / f"world_model-{batch}x{length}.pt"
 
 
 def half_noise(like: Tensor) -> Tensor:
-    """Stands in for `torch.randn_like` while losses are compared: z is the mean plus half a deviation on both sides."""
+    """Replace `torch.randn_like` while losses are compared: z is the mean plus half a standard deviation."""
     return torch.full_like(like, 0.5)

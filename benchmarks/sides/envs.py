@@ -1,4 +1,4 @@
-"""Environment steps with image: one environment in this process, or several in a process each."""
+"""Environment steps with images: one environment in this process, or several in their own processes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,17 +19,17 @@ from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 
 
 def ours(folder: Path, processes: int, seconds: float) -> Prepared:
-    """Steps per second of metaworld_mt, 64x64."""
+    """Time steps of metaworld_mt with 64x64 pixels."""
     return _prepared(MetaworldMTEnv, processes, seconds)
 
 
 def lerobot(folder: Path, processes: int, seconds: float) -> Prepared:
-    """Steps per second of LeRobot's metaworld, which draws 480x480 pixels."""
+    """Time steps of LeRobot's metaworld, which draws 480x480 pixels."""
     return _prepared(partial(MetaworldEnv, obs_type="pixels_agent_pos"), processes, seconds)
 
 
 def metaworld_64(folder: Path, processes: int, seconds: float) -> Prepared:
-    """Steps per second of Meta-World itself at 64x64, its other drawing settings as they are."""
+    """Time steps of Meta-World itself with 64x64 pixels and its default drawing settings."""
     return _prepared(_metaworld, processes, seconds)
 
 
@@ -45,13 +45,15 @@ def _metaworld(task: str) -> gym.Env:
 def _prepared(make_env: Callable[[str], gym.Env], processes: int, seconds: float) -> Prepared:
     def measure() -> float:
         rates = [_steps_per_second(make_env, task, processes, seconds / len(MT6)) for task in MT6]
-        return len(rates) / sum(1 / rate for rate in rates)  # as if all tasks made equally many steps
+        return len(rates) / sum(
+            1 / rate for rate in rates
+        )  # harmonic mean: all tasks make equally many steps
 
     return Prepared(measure)
 
 
 def _steps_per_second(make_env: Callable[[str], gym.Env], task: str, processes: int, seconds: float) -> float:
-    """Of all processes together, under small random actions."""
+    """Measure the steps per second of all processes together, with small random actions."""
     env_fns = [partial(make_env, task)] * processes
     envs: Any = SyncVectorEnv(env_fns) if processes == 1 else AsyncVectorEnv(env_fns, context="forkserver")
     actions = np.random.default_rng(0).uniform(-0.2, 0.2, (1000, processes, ACTION_DIM)).astype(np.float32)

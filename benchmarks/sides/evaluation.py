@@ -1,4 +1,4 @@
-"""Rollouts of one policy, by `lerobot-wm eval` and by LeRobot's stock environment and command."""
+"""Rollouts of one policy with `lerobot-wm eval`, and with LeRobot's own environment and command."""
 
 from pathlib import Path
 
@@ -10,12 +10,12 @@ from benchmarks.sides.command import per_minute
 from benchmarks.timing import Prepared
 from lerobot_wm.constants import IMAGE_SIZE
 
-LEROBOT_VIDEOS = 10  # of each task, which lerobot-eval makes without a flag against it
-LEROBOT_IMAGE_SIZE = 480  # its metaworld environment has no other; the policy scales its images down
+LEROBOT_VIDEOS = 10  # per task; lerobot-eval has no flag to change it
+LEROBOT_IMAGE_SIZE = 480  # the only size of its metaworld environment; the policy scales images down
 
 
 def ours(folder: Path, rollouts_per_task: int, workers: int) -> Prepared:
-    """Rollouts per minute of `lerobot-wm eval` on metaworld_mt."""
+    """Measure rollouts per minute of `lerobot-wm eval` on metaworld_mt."""
     command = [
         *("lerobot_wm.cli", "eval", "--env.type=metaworld_mt"),
         *(f"--num_workers={workers}", f"--videos_per_task={min(LEROBOT_VIDEOS, rollouts_per_task)}"),
@@ -24,7 +24,7 @@ def ours(folder: Path, rollouts_per_task: int, workers: int) -> Prepared:
 
 
 def lerobot(folder: Path, rollouts_per_task: int, workers: int) -> Prepared:
-    """Rollouts per minute of `lerobot-eval` on metaworld, which has no flag for workers."""
+    """Measure rollouts per minute of `lerobot-eval` on metaworld; it has no flag for workers."""
     command = ["lerobot.scripts.lerobot_eval", "--env.type=metaworld"]
     return _prepared(command, LEROBOT_IMAGE_SIZE, folder, rollouts_per_task)
 
@@ -32,7 +32,7 @@ def lerobot(folder: Path, rollouts_per_task: int, workers: int) -> Prepared:
 def _prepared(command: list[str], image_size: int, folder: Path, rollouts_per_task: int) -> Prepared:
     checkpoint = folder / f"wm_bc-{image_size}"
     if not checkpoint.is_dir():
-        # Untrained, it never succeeds: every rollout takes its 500 steps on both sides.
+        # The untrained policy never succeeds, so every rollout takes 500 steps on both sides.
         policy = wm_bc(image_size)
         policy.save_pretrained(checkpoint)
         for processor in make_pre_post_processors(policy.config):

@@ -1,4 +1,4 @@
-"""Milliseconds of `select_action` on a batch of 64x64 images."""
+"""Duration in ms of `select_action` on a batch of 64x64 images."""
 
 from pathlib import Path
 
@@ -14,17 +14,17 @@ from lerobot_wm.envs.tasks import task_description
 
 
 def ours(folder: Path, batch: int, seconds: float) -> Prepared:
-    """wm_bc: filters the image and acts, every step."""
+    """Time wm_bc, which filters an image and acts in every step."""
     return _prepared(wm_bc(IMAGE_SIZE), batch, seconds)
 
 
 def act_closed_loop(folder: Path, batch: int, seconds: float) -> Prepared:
-    """ACT that looks at every image, with the temporal ensembling of its paper."""
+    """Time ACT looking at every image, with the temporal ensembling of its paper."""
     return _prepared(_act(n_action_steps=1, temporal_ensemble_coeff=0.01), batch, seconds)
 
 
 def act_chunks(folder: Path, batch: int, seconds: float) -> Prepared:
-    """ACT as LeRobot sets it: it looks at one image in 100; the mean over such a hundred."""
+    """Time ACT with LeRobot's defaults, which look at one image in 100: the mean over 100 steps."""
     return _prepared(_act(), batch, seconds, steps=100)
 
 
@@ -34,7 +34,7 @@ def _act(**settings: float) -> ACTPolicy:
         push_to_hub=False,
         input_features=input_features(IMAGE_SIZE),
         output_features=output_features(),
-        pretrained_backbone_weights=None,  # they would be downloaded
+        pretrained_backbone_weights=None,  # avoids a download
         **settings,  # type: ignore[arg-type]
     )
     return ACTPolicy(config).eval()

@@ -1,4 +1,4 @@
-"""Batches from LeRobot's DataLoader, and the same batches from ours."""
+"""The same batches from LeRobot's DataLoader and from ours."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +19,7 @@ CPU = torch.device("cpu")
 def ram_windows(
     folder: Path, episodes_per_task: int, batch: int, length: int, workers: int, seconds: float
 ) -> Prepared:
-    """Windows per second from RAM, which needs no workers."""
+    """Time windows from RAM, which needs no workers."""
     loader = _in_ram(_windows(folder, episodes_per_task, batch, length, workers))
     return _prepared(loader, workers, seconds, per_batch=batch)
 
@@ -27,25 +27,25 @@ def ram_windows(
 def lerobot_windows(
     folder: Path, episodes_per_task: int, batch: int, length: int, workers: int, seconds: float
 ) -> Prepared:
-    """Windows per second from LeRobot's loader."""
+    """Time windows from LeRobot's loader."""
     loader = _windows(folder, episodes_per_task, batch, length, workers)
     return _prepared(loader, workers, seconds, per_batch=batch)
 
 
 def ram_latents(folder: Path, episodes_per_task: int, batch: int, workers: int, seconds: float) -> Prepared:
-    """Batches of latent transitions per second from RAM."""
+    """Time batches of latent transitions from RAM."""
     return _prepared(_in_ram(_transitions(folder, episodes_per_task, batch, workers)), workers, seconds)
 
 
 def lerobot_latents(
     folder: Path, episodes_per_task: int, batch: int, workers: int, seconds: float
 ) -> Prepared:
-    """Batches of latent transitions per second from LeRobot's loader."""
+    """Time batches of latent transitions from LeRobot's loader."""
     return _prepared(_transitions(folder, episodes_per_task, batch, workers), workers, seconds)
 
 
 def _windows(folder: Path, episodes_per_task: int, batch: int, length: int, workers: int) -> DataLoader:
-    """LeRobot's loader as `lerobot-train --policy.type=wm_rssm` makes it."""
+    """Make LeRobot's loader as `lerobot-train --policy.type=wm_rssm` does."""
     deltas = [i / FPS for i in range(length)]
     dataset = LeRobotDataset(
         REPO_ID,
@@ -57,14 +57,14 @@ def _windows(folder: Path, episodes_per_task: int, batch: int, length: int, work
 
 
 def _transitions(folder: Path, episodes_per_task: int, batch: int, workers: int) -> DataLoader:
-    """LeRobot's loader as `lerobot-train --policy.type=wm_iql` makes it."""
+    """Make LeRobot's loader as `lerobot-train --policy.type=wm_iql` does."""
     root, _ = latents(folder, episodes_per_task)
     deltas = {key: [0.0, 1 / FPS] for key in (OBS_LATENT, OBS_STATE)}
     return _loader(LeRobotDataset(REPO_ID, root=root, delta_timestamps=deltas), batch, workers)
 
 
 class _Endless:
-    """A sampler's epochs, one after the other: `lerobot-train` too keeps its workers from epoch to epoch."""
+    """A sampler's epochs in a row, because `lerobot-train` too keeps its workers between epochs."""
 
     def __init__(self, sampler: EpisodeAwareSampler | EpochOrder) -> None:
         self.sampler = sampler
@@ -82,12 +82,12 @@ def _loader(dataset: LeRobotDataset, batch: int, workers: int, drop_n_last_frame
         drop_n_last_frames=drop_n_last_frames,
         shuffle=True,
     )
-    # As many batches ahead as in lerobot-train.
+    # Prefetch as lerobot-train does.
     return DataLoader(dataset, batch, sampler=_Endless(sampler), num_workers=workers, prefetch_factor=4)
 
 
 def _in_ram(loader: DataLoader) -> RamLoader:
-    # As in `lerobot-wm train`: the same samples in the same order, looked up epoch by epoch.
+    # The same samples in the same order, looked up epoch by epoch as in `lerobot-wm train`.
     assert isinstance(loader.sampler, _Endless)
     assert isinstance(loader.sampler.sampler, EpisodeAwareSampler)
     assert loader.batch_size is not None
@@ -97,8 +97,8 @@ def _in_ram(loader: DataLoader) -> RamLoader:
 
 def _prepared(loader: DataLoader | RamLoader, workers: int, seconds: float, per_batch: int = 1) -> Prepared:
     def measure() -> float:
-        # Workers start anew each time, so that none fills its queue unseen. They deliver at about the same time:
-        # whole rounds of them are counted, from the end of the first.
+        # New workers each time, so that no queue fills before the measurement. They deliver at about the same time,
+        # so count whole rounds, starting at the end of the first.
         batches = iter(loader)
 
         def draw_round() -> int:

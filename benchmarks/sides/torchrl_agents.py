@@ -1,4 +1,4 @@
-"""One update with TorchRL's IQLLoss and BCLoss: our networks' sizes and settings, its modules, one Adam over all."""
+"""Updates of TorchRL's IQLLoss and BCLoss with our network sizes and settings, and one Adam for all."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +28,7 @@ FACTS = {"dtype": "float32", "torchrl": torchrl.__version__}
 
 
 def iql(folder: Path, batch: int, seconds: float) -> Prepared:
-    """Updates per second, target networks included."""
+    """Time updates of IQL, target networks included."""
     torch.manual_seed(0)
     mean = nn.Sequential(_mlp(OBSERVATION_DIM, ACTION_DIM, DROPOUT), nn.Tanh())
     actor = ProbabilisticActor(
@@ -75,7 +75,7 @@ def iql(folder: Path, batch: int, seconds: float) -> Prepared:
 
 
 def bc(folder: Path, batch: int, seconds: float) -> Prepared:
-    """Updates per second."""
+    """Time updates of BC."""
     torch.manual_seed(0)
     actor = TensorDictModule(
         _mlp(OBSERVATION_DIM, ACTION_DIM, DROPOUT), in_keys=["observation"], out_keys=["action"]

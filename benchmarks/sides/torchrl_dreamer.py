@@ -1,7 +1,7 @@
-"""The same training step with TorchRL's Dreamer: its modules, its loss, its rollout, our weights and our batch.
+"""Training steps of TorchRL's Dreamer: its modules, loss and rollout with our weights and batch.
 
-One layer is changed: the activation after the decoder's first linear layer is taken out, which neither Dreamer V1 nor
-our model has.
+One layer is changed: the activation after the decoder's first linear layer is removed. Neither Dreamer V1 nor our model
+has it.
 """
 
 from pathlib import Path
@@ -25,19 +25,19 @@ LEARNING_RATE, CLIP = 6e-4, 100.0
 
 
 def prepare(folder: Path, batch: int, length: int, seconds: float) -> Prepared:
-    """Training steps per second, and loss, its parts and its gradient's norm before any step.
+    """Time training steps, and report the loss, its parts and its gradient norm before the first step.
 
     Args:
-        folder: Where our side left its weights and batch.
+        folder: Folder where our side saved its weights and batch.
         batch: B.
         length: T.
-        seconds: Of one measurement.
+        seconds: Duration of one measurement.
     """
     saved = torch.load(batch_file(folder, batch, length), weights_only=True)
     world_model = _world_model()
     _load(world_model, saved["weights"])
     loss_module = DreamerModelLoss(world_model)
-    # Ours filters o_t with a_{t-1}, and the reward r_{t-1} belongs to frame t: TorchRL's transitions from t-1 to t.
+    # Ours filters o_t with a_{t-1}, and predicts r_{t-1} at frame t. In TorchRL these are transitions from t-1 to t.
     prev_actions = nn.functional.pad(saved["actions"][:, :-1], (0, 0, 1, 0))  # (B, T, A)
     rewards = nn.functional.pad(saved["rewards"][:, :-1], (1, 0)).unsqueeze(-1)  # (B, T, 1)
 
@@ -58,8 +58,7 @@ def prepare(folder: Path, batch: int, length: int, seconds: float) -> Prepared:
         return sum(losses.values()).squeeze(), states
 
     with patch("torch.randn_like", half_noise):
-        # A window's first frame has no reward that came with it, and ours asks none of it: what is predicted there
-        # is made the target, which leaves an error of zero.
+        # Our loss has no reward target at a window's first frame. Use the prediction as the target there: error zero.
         with torch.no_grad():
             rewards[:, 0] = loss()[1]["next", "reward"][:, 0]
         facts = _losses(loss_module, data())
@@ -76,7 +75,7 @@ def prepare(folder: Path, batch: int, length: int, seconds: float) -> Prepared:
 
 
 def _losses(loss_module: DreamerModelLoss, data: TensorDict) -> dict[str, float]:
-    """The loss, its parts and its gradient's norm by our names; `kl` without the free nats, which may hide it."""
+    """Return the loss, its parts and its gradient norm under our names; `kl` without the free nats."""
     total = sum(loss_module(data)[0].values())
     total.backward()
     norm = nn.utils.get_total_norm(p.grad for p in loss_module.parameters())
@@ -91,7 +90,7 @@ def _losses(loss_module: DreamerModelLoss, data: TensorDict) -> dict[str, float]
 
 
 def _world_model() -> WorldModelWrapper:
-    """As TorchRL's Dreamer example composes it, at the sizes of our model."""
+    """Compose the world model like TorchRL's Dreamer example, with the sizes of our model."""
     decoder = ObsDecoder(latent_dim=STATE + HIDDEN)
     decoder.state_to_latent[1] = nn.Identity()
     prior = RSSMPrior(Bounded(-1, 1, (ACTION,)), HIDDEN, HIDDEN, STATE, action_dim=ACTION)
@@ -123,10 +122,10 @@ def _world_model() -> WorldModelWrapper:
 
 
 def _load(world_model: WorldModelWrapper, weights: dict[str, Tensor]) -> None:
-    """Copy our weights: the parameters of both come in the same order within each part.
+    """Copy our weights; within each part, the parameters of both models have the same order.
 
     Raises:
-        RuntimeError: A parameter has no counterpart of its shape.
+        RuntimeError: The shapes of two parameters differ.
     """
     encoder, rollout, decoder = (world_model[0][i] for i in range(3))
     prior, posterior = rollout.rssm_prior.module, rollout.rssm_posterior.module
@@ -146,5 +145,7 @@ def _load(world_model: WorldModelWrapper, weights: dict[str, Tensor]) -> None:
             if name in ("decoder.input.weight", "reward_head.trunk.0.weight"):
                 value = value.roll(STATE, dims=1)  # theirs reads [z, d], ours [d, z]
             if parameter.shape != value.shape:
-                raise RuntimeError(f"{name} is {tuple(value.shape)}, TorchRL's is {tuple(parameter.shape)}.")
+                raise RuntimeError(
+                    f"{name}: our shape is {tuple(value.shape)}, TorchRL's {tuple(parameter.shape)}."
+                )
             parameter.data.copy_(value)

@@ -1,4 +1,4 @@
-"""`lerobot-wm train` and `lerobot-train` with the same flags, timed by their own log lines."""
+"""`lerobot-wm train` and `lerobot-train` with the same flags, timed by their log lines."""
 
 import os
 import re
@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,44 +15,37 @@ from benchmarks.timing import Prepared
 
 OURS = "lerobot_wm.cli", "train"
 LEROBOT = ("lerobot.scripts.lerobot_train",)
-LOG_LINE = re.compile(r"\bstep:\d")  # LeRobot's metrics, one line every `log_freq` steps
-PREFETCH_FACTOR = 4  # LeRobot's default: batches each worker has ready when training starts
+LOG_LINE = re.compile(r"\bstep:\d")  # LeRobot logs one such line every `log_freq` steps
+PREFETCH_FACTOR = 4  # LeRobot's default: batches that each worker has ready when training starts
 
 
 def wm_rssm(folder: Path, **size: Any) -> Prepared:
-    """Our command, the world model."""
+    """Time our command training the world model."""
     return _prepared(OURS, folder, "wm_rssm", log_freq=1, **size)
 
 
 def lerobot_wm_rssm(folder: Path, **size: Any) -> Prepared:
-    """LeRobot's command, the world model."""
+    """Time LeRobot's command training the world model."""
     return _prepared(LEROBOT, folder, "wm_rssm", log_freq=1, **size)
 
 
 def wm_iql(folder: Path, **size: Any) -> Prepared:
-    """Our command, IQL on latents."""
+    """Time our command training IQL on latents."""
     return _prepared(OURS, folder, "wm_iql", log_freq=50, **size)
 
 
 def lerobot_wm_iql(folder: Path, **size: Any) -> Prepared:
-    """LeRobot's command, IQL on latents."""
+    """Time LeRobot's command training IQL on latents."""
     return _prepared(LEROBOT, folder, "wm_iql", log_freq=2, **size)
 
 
-def in_one_step(folder: Path, policy: str, updates: int, batch: int, width: int, seconds: float) -> Prepared:
-    """Our command, a policy with networks of one width, several updates on `batch` samples each in a step."""
-    flags = (f"--policy.updates_per_step={updates}", f"--policy.hidden_dims=[{width},{width}]")
-    size = {"batch": updates * batch, "episodes_per_task": 16, "workers": 0, "seconds": seconds}
-    return _prepared(OURS, folder, policy, log_freq=max(1, 50 // updates), flags=flags, **size)
-
-
 def wm_bc(folder: Path, **size: Any) -> Prepared:
-    """Our command, BC on latents."""
+    """Time our command training BC on latents."""
     return _prepared(OURS, folder, "wm_bc", log_freq=50, **size)
 
 
 def lerobot_wm_bc(folder: Path, **size: Any) -> Prepared:
-    """LeRobot's command, BC on latents."""
+    """Time LeRobot's command training BC on latents."""
     return _prepared(LEROBOT, folder, "wm_bc", log_freq=2, **size)
 
 
@@ -67,7 +59,6 @@ def _prepared(
     episodes_per_task: int,
     workers: int,
     seconds: float,
-    flags: Sequence[str] = (),
 ) -> Prepared:
     if policy == "wm_rssm":
         dataset, of_policy = demonstrations(folder, episodes_per_task), []
@@ -84,24 +75,23 @@ def _prepared(
         f"--num_workers={workers}",
         f"--log_freq={log_freq}",
         *("--steps=1000000", "--save_checkpoint=false", "--seed=0"),
-        *flags,
     ]
-    warm_up = workers * PREFETCH_FACTOR  # these steps are fed with what was ready before
+    warm_up = workers * PREFETCH_FACTOR  # these steps use batches that were ready before
     return Prepared(lambda: _steps_per_second(command, folder, log_freq, warm_up, seconds))
 
 
 def _steps_per_second(command: list[str], folder: Path, log_freq: int, warm_up: int, seconds: float) -> float:
-    """Between two log lines of a command, which is then ended.
+    """Measure steps per second between two log lines of a command, then end it.
 
     Args:
         command: The command without its output folder.
-        folder: Where that is made.
-        log_freq: Steps from line to line.
-        warm_up: Steps that are over at the first of the two lines.
-        seconds: Time after which the second one is the next line.
+        folder: Parent of the output folder.
+        log_freq: Steps between log lines.
+        warm_up: Steps to skip before the first line counts.
+        seconds: Minimum time between the two lines.
 
     Raises:
-        RuntimeError: The command ended before.
+        RuntimeError: The command ended early.
     """
     output = Path(tempfile.mkdtemp(dir=folder)) / "run"
     process = subprocess.Popen(
@@ -109,7 +99,7 @@ def _steps_per_second(command: list[str], folder: Path, log_freq: int, warm_up: 
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        start_new_session=True,  # so that its loader's workers end with it
+        start_new_session=True,  # so that the loader's workers can be ended with it
     )
     assert process.stdout is not None
     lines: list[str] = []

@@ -1,4 +1,4 @@
-"""A training step of the world model: gradients, clipping and Adam on a batch of windows."""
+"""Training steps of our world model: gradients, clipping and Adam on a batch of windows."""
 
 from pathlib import Path
 from unittest.mock import patch
@@ -15,13 +15,13 @@ from lerobot_wm.world_model.model import WorldModel
 
 
 def prepare(folder: Path, batch: int, length: int, seconds: float) -> Prepared:
-    """Training steps per second, and loss, its parts and its gradient's norm before any step.
+    """Time training steps, and report the loss, its parts and its gradient norm before the first step.
 
     Args:
-        folder: Weights and batch are left there.
+        folder: Folder to save weights and batch to, for the peer.
         batch: B.
         length: T.
-        seconds: Of one measurement.
+        seconds: Duration of one measurement.
     """
     torch.manual_seed(0)
     config = WMRSSMConfig(device="cpu")
@@ -36,13 +36,13 @@ def prepare(folder: Path, batch: int, length: int, seconds: float) -> Prepared:
     )
 
     def loss() -> tuple[Tensor, dict[str, Tensor]]:
-        images = frames.movedim(-1, -3).float() / 255  # (B, T, C, H, W), as LeRobot's loop is given them
+        images = frames.movedim(-1, -3).float() / 255  # (B, T, C, H, W), as LeRobot's loop receives them
         return model.loss(images, actions, valid, rewards)
 
     with patch("torch.randn_like", half_noise):
-        total, parts = loss()  # in float32: in bfloat16 it differs by more than the sides may
+        total, parts = loss()  # in float32; bfloat16 would differ by more than the tolerance
         total.backward()
-    # `kl` is the divergence itself, which the free nats may hide in the loss.
+    # `kl` is the divergence itself, without the free nats that may hide it in the loss.
     facts = {"loss": total.item()} | {
         name: parts[name].item() for name in ("image_loss", "reward_loss", "kl")
     }

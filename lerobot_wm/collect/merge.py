@@ -9,14 +9,10 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
-from lerobot.datasets.aggregate import (
-    ChunkFile,
-    VideoIndexState,
-    merge_video_feature_info_for_aggregate,
-    update_meta_data,
-)
+from lerobot.datasets.aggregate import merge_video_feature_info_for_aggregate, update_meta_data
 from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import (
@@ -40,6 +36,9 @@ from lerobot.datasets.utils import (
 from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
 
 from lerobot_wm.data.check import check_dataset
+
+type ChunkFile = tuple[int, int]  # a file's numbers: of its chunk, and in it
+type VideoIndexState = dict[str, dict[str, Any]]  # by camera: where its files went, as LeRobot notes it
 
 
 def merge_datasets(sources: list[Path], repo_id: str, root: Path) -> None:

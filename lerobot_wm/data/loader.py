@@ -1,10 +1,10 @@
 """Batches equal to LeRobot's DataLoader, gathered from RAM or GPU memory; images at the size a policy takes."""
 
 import logging
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.sampler import EpisodeAwareSampler
@@ -20,42 +20,32 @@ class EpochOrder:
     """Yields what a shuffling `EpisodeAwareSampler` yields, in the same order, and moves it on by the same epochs.
 
     The sampler searches each sample's episode in Python, which for a batch of latents takes longer than gathering it.
-
-    Args:
-        sampler: LeRobot's; a state loaded into it counts from the next epoch on.
-        multiple: Each epoch is filled up with its first samples to a multiple of so many.
     """
 
-    def __init__(self, sampler: EpisodeAwareSampler, multiple: int = 1) -> None:
+    def __init__(self, sampler: EpisodeAwareSampler) -> None:
         self._sampler = sampler
         self._rows = torch.tensor(sampler.indices)  # (N,) dataset row of each position of the sampler
-        self._length = math.ceil(len(self._rows) / multiple) * multiple
 
     def __iter__(self) -> Iterator[int]:
         state = self._sampler.state_dict()
-        iter(self._sampler)  # counts the epoch
-        generator = self._sampler._epoch_generator(state["epoch"])
-        order = torch.randperm(len(self._rows), generator=generator)  # (N,)
-        filled = order[torch.arange(state["start_index"], self._length) % len(order)]
-        return iter(self._rows[filled].tolist())
+        self._sampler.load_state_dict({"epoch": state["epoch"] + 1, "start_index": 0})
+        # The sampler documents its order as a function of its seed and the epoch.
+        seed = np.random.SeedSequence([self._sampler.seed, state["epoch"]]).generate_state(1, np.uint64)[0]
+        order = torch.randperm(len(self._rows), generator=torch.Generator().manual_seed(int(seed)))
+        return iter(self._rows[order[state["start_index"] :]].tolist())
 
     def __len__(self) -> int:
-        return self._length
+        return len(self._rows)
 
 
-def batches_of_rows(data_loader: DataLoader, *, fill: bool = False) -> Any:
-    """The batch sampler of a loader that LeRobot built, or a faster one of the same batches.
-
-    Args:
-        data_loader: The loader.
-        fill: Fill the last batch of an epoch that is shuffled up with the epoch's first samples.
-    """
+def batches_of_rows(data_loader: DataLoader) -> Any:
+    """The batch sampler of a loader that LeRobot built, or a faster one of the same batches."""
     sampler = data_loader.sampler
     if not (isinstance(sampler, EpisodeAwareSampler) and sampler.shuffle):
         return data_loader.batch_sampler
     size = data_loader.batch_size
     assert size is not None  # LeRobot's loaders batch
-    return BatchSampler(EpochOrder(sampler, size if fill else 1), size, data_loader.drop_last)
+    return BatchSampler(EpochOrder(sampler), size, data_loader.drop_last)
 
 
 logger = logging.getLogger(__name__)
@@ -89,7 +79,7 @@ class RamDataset:
         device: torch.device,
         cameras: Mapping[str, tuple[int, int]] | None = None,
     ) -> None:
-        if dataset.reader._image_transforms is not None:
+        if dataset.image_transforms is not None:
             raise ValueError(
                 "--dataset.image_transforms.enable=true has no effect on frames served from RAM: "
                 "turn it off, or train with lerobot-train."
@@ -122,9 +112,8 @@ class RamDataset:
             for key in meta.camera_keys
             if cameras is None or key in cameras
         }
-        self._frame_of_row = self._columns[
-            "index"
-        ]  # (N,), which is no row's number where episodes were chosen
+        # (N,), which is no row's number where episodes were chosen.
+        self._frame_of_row = self._columns["index"]
         if self._fit_on_device():
             self._move_frames()
 
@@ -220,18 +209,10 @@ class RamLoader:
             dataset, self._subset = dataset.dataset, dataset.indices
         self._batch_sampler = batch_sampler
         self._source = RamDataset(dataset, device, cameras)
-        self._episodes = torch.empty(0)
-
-    @property
-    def episodes(self) -> list[int]:
-        """The episodes in the batch served last."""
-        return sorted(set(self._episodes.tolist()))
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for rows in self._batch_sampler:
-            batch = self._source.batch(rows if self._subset is None else [self._subset[i] for i in rows])
-            self._episodes = batch["episode_index"]  # (B,)
-            yield batch
+            yield self._source.batch(rows if self._subset is None else [self._subset[i] for i in rows])
 
     def __len__(self) -> int:
         return len(self._batch_sampler)  # type: ignore[arg-type]

@@ -6,11 +6,10 @@ spread over processes, and every rollout leaves a line in a records file.
 
 import json
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from functools import partialmethod
-from io import StringIO
 
 import torch
 from lerobot.configs import parser
@@ -39,8 +38,6 @@ _worker_run: Callable[[str], list[Record]]
 def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
     global _worker_run
     drop_remarks()
-    # LeRobot's bars of several processes would overwrite each other, and the parent's.
-    tqdm.__init__ = partialmethod(tqdm.__init__, file=StringIO())  # type: ignore[assignment, method-assign]
     torch.set_num_threads(threads)
     _worker_run = TaskRunner(cfg).run
 
@@ -55,6 +52,9 @@ def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
         return map(TaskRunner(cfg).run, tasks)
     workers = min(cfg.num_workers, len(tasks))
     threads = max(1, usable_cores() // workers)
+    # LeRobot's progress bars of several processes would overwrite each other, and the parent's. tqdm reads this when a
+    # worker imports it: no bar is shown before so many seconds.
+    os.environ["TQDM_DELAY"] = "1000000000"
     return map_in_workers(_run_in_worker, tasks, workers, _start_worker, cfg, threads)
 
 

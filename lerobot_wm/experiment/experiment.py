@@ -56,7 +56,7 @@ class Experiment:
     Args:
         plan: Builds the stages.
         runs: The arms and seeds.
-        results_dir: Committed records.
+        results_dir: Committed records, compressed.
         processes: How many stages run side by side at most.
         quality: Whether the world model's quality is measured too.
     """
@@ -69,7 +69,7 @@ class Experiment:
         self.processes = processes
         suffix = "" if plan.variation_set == REPORTED_VARIATION_SET else f"_set{plan.variation_set}"
         records = f"records{suffix}.jsonl"
-        self._committed = results_dir / records
+        self._committed = results_dir / f"{records}.gz"
         self.ledger = Ledger(plan.output_dir / records, self._committed, plan.preset)
         self.report_dir = plan.output_dir / f"report{suffix}"
         self.times = Times(plan.output_dir / "times.json", plan.preset.minutes)

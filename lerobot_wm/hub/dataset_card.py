@@ -9,7 +9,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
 from lerobot_wm.envs.tasks import task_description
-from lerobot_wm.hub.markdown import Markdown, render
+from lerobot_wm.markdown import Markdown, render
 
 PAPER = "World Models for Multi-task Robotic Pretraining"
 META_WORLD_PAPER = "Meta-World, https://arxiv.org/abs/1910.10897"
@@ -37,7 +37,7 @@ def push_demonstrations(dataset: LeRobotDataset, record: dict[str, Any], private
         for task in record["config"]["tasks"]
     ]
     description = render(
-        "demonstrations.md.j2",
+        Path(__file__).with_name("demonstrations.md.j2"),
         repo_id=dataset.repo_id,
         config=record["config"],
         versions=record["versions"],
@@ -79,7 +79,7 @@ def push_latents(
         license: Its licence, as the Hub names it; None leaves it open.
     """
     description = render(
-        "latents.md.j2",
+        Path(__file__).with_name("latents.md.j2"),
         repo_id=dataset.repo_id,
         record=record,
         encoder=encoder,

@@ -26,8 +26,8 @@ from lerobot_wm.constants import (
 from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
 from lerobot_wm.envs.cameras import CAMERAS
 from lerobot_wm.envs.tasks import all_tasks, task_description
-from lerobot_wm.hub.markdown import Markdown, render
 from lerobot_wm.hub.train_command import train_command
+from lerobot_wm.markdown import Markdown, render
 
 
 def eval_command(config: PreTrainedConfig, repo_id: str) -> str:
@@ -144,7 +144,7 @@ def model_card(
         datasets=datasets,
     )
     body = render(
-        "model_card.md.j2",
+        Path(__file__).with_name("model_card.md.j2"),
         type=config.type,
         settings=settings,
         makes_latents=makes_latents,

@@ -19,10 +19,10 @@ from PIL import Image
 from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.source import dataset_folder
 from lerobot_wm.hub.errors import check_can_push
-from lerobot_wm.hub.markdown import escaped
 from lerobot_wm.hub.model_card import IMAGINATION, TrainingData, model_card
 from lerobot_wm.inspect.episodes import check_features
 from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, OpenLoop, load_world_model, open_loop
+from lerobot_wm.markdown import escaped
 from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.records import Record, find_records, read_records
 from lerobot_wm.tables import Cell, ReportTable, markdown_table, table_by_split

@@ -25,7 +25,6 @@ _FILLED_IN = {
     "policy.rssm.image_channels",
     "policy.rssm.action_dim",
     "policy.rssm.proprio_dim",
-    "policy.rssm.centred_start",
     "policy.world_model",
     "policy.world_model_fingerprint",
     "policy.trained_betas",

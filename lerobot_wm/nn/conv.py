@@ -1,11 +1,12 @@
 """Dreamer's image encoder and decoder for 64x64 frames (Hafner et al. 2019, as laid out in TorchRL)."""
 
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from lerobot_wm.nn.fast_cpu import UpsamplingConv
 
 IMAGE_SIZE = 64  # the strides and kernels below fix it: 64-31-14-6-2 down, 1-5-13-30-64 up
 ENCODER_CHANNELS = (32, 64, 128, 256)
@@ -25,54 +26,10 @@ class ConvEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Map images (N, C, 64, 64) in [0, 1] to embeddings e_t (N, 1024)."""
-        # channels_last is 1.3-1.5 times faster on CPUs and lets GPUs use tensor cores. Only the activations are
-        # laid out so: LeRobot cannot save optimizer states of weights that are.
+        # channels_last is 1.3-1.5 times faster on CPUs and lets GPUs use tensor cores. The weights keep the default
+        # layout: LeRobot cannot save the optimizer state of channels_last weights.
         features = self.layers(images.contiguous(memory_format=torch.channels_last))  # (N, 256, 2, 2)
         return features.flatten(1)
-
-
-class _ParityConvTranspose(torch.autograd.Function):
-    """A stride-2 transposed convolution whose forward pass is a 3x3 convolution and a pixel shuffle.
-
-    Output pixels of equal parity in x and y see the same taps of the kernel, so the four parities are four
-    channels of one ordinary convolution. oneDNN runs that three times faster than the transposed form when it
-    has few output channels or few pixels; its backward pass is fast as it is.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        ctx.save_for_backward(x, weight)
-        c_in, c_out, kernel, _ = weight.shape
-        padded = F.pad(weight, (0, 6 - kernel, 0, 6 - kernel))  # (C_in, C_out, 6, 6)
-        # Tap 2j + r of the kernel adds input q - j to output 2q + r.
-        taps = padded.reshape(c_in, c_out, 3, 2, 3, 2).flip(2, 4).permute(1, 3, 5, 0, 2, 4)
-        parities = F.conv2d(x, taps.reshape(4 * c_out, c_in, 3, 3), bias.repeat_interleave(4), padding=2)
-        out = F.pixel_shuffle(parities, 2)  # (N, C_out, 2H + 4, 2W + 4)
-        # A copy of the crop: the activation that follows works in place, which autograd forbids on views.
-        return out if kernel == 6 else out[..., :-1, :-1].clone()
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        x, weight = ctx.saved_tensors
-        grad = grads[0].contiguous(memory_format=torch.channels_last)
-        stride, padding, dilation, output_padding = [2, 2], [0, 0], [1, 1], [0, 0]
-        return torch.ops.aten.convolution_backward(
-            grad, x, weight, [weight.shape[1]], stride, padding, dilation, True, output_padding, 1, [True] * 3
-        )
-
-
-class UpsamplingConv(nn.ConvTranspose2d):
-    """A stride-2 transposed convolution without padding, kernel 5 or 6, faster on CPUs."""
-
-    def __init__(self, c_in: int, c_out: int, kernel_size: int) -> None:
-        super().__init__(c_in, c_out, kernel_size, stride=2)
-
-    def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]  # output_size is never asked for
-        """Map (N, C_in, H, W) to (N, C_out, 2H + k - 2, 2W + k - 2)."""
-        if x.device.type != "cpu":
-            return super().forward(x)
-        bias = self.get_parameter("bias")
-        return _ParityConvTranspose.apply(x, self.weight.to(x.dtype), bias.to(x.dtype))
 
 
 class ConvDecoder(nn.Module):
@@ -94,7 +51,7 @@ class ConvDecoder(nn.Module):
     def forward(self, latents: Tensor) -> Tensor:
         """Map latents s_t (N, latent_dim) to image means (N, C, 64, 64)."""
         hidden = self.input(latents)  # (N, 1024)
-        # On a 1x1 input a transposed convolution is one matrix product, and far faster as one.
+        # On a 1x1 input a transposed convolution is one matrix product, which runs far faster.
         weight = self.first.weight.permute(0, 2, 3, 1).flatten(1)  # (1024, 5·5·128)
         patch = F.linear(hidden, weight.T).unflatten(1, (5, 5, 128)).permute(0, 3, 1, 2)  # (N, 128, 5, 5)
         bias = self.first.get_parameter("bias")  # (128,)

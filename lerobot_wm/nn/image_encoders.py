@@ -10,13 +10,13 @@ from torch import Tensor, nn
 class SpatialEmbeddings(nn.Module):
     """F learned weighted sums over the positions of each channel (PTR, Kumar et al. 2022).
 
-    Average pooling forgets position; a weight per channel and position keeps it at C·F outputs.
+    Average pooling forgets where a feature is. Weights per channel and position keep that, with only C·F outputs.
 
     Args:
         channels: C of the feature map.
-        height: Its H.
-        width: Its W.
-        num_features: F, the weighted sums per channel.
+        height: H of the feature map.
+        width: W of the feature map.
+        num_features: F, the number of weighted sums per channel.
     """
 
     def __init__(self, channels: int, height: int, width: int, num_features: int = 8) -> None:
@@ -26,7 +26,7 @@ class SpatialEmbeddings(nn.Module):
 
     @property
     def output_dim(self) -> int:
-        """C·F."""
+        """Number of outputs, C·F."""
         return self.kernel.shape[0] * self.kernel.shape[3]
 
     def forward(self, features: Tensor) -> Tensor:
@@ -72,7 +72,7 @@ class ImageEncoder(nn.Module):
 
     Args:
         name: "small", or torchvision's "resnet18" or "resnet34".
-        image_shape: (C, H, W) of the images; the embeddings hold weights for this size only.
+        image_shape: (C, H, W) of the images. The encoder takes no other size.
     """
 
     def __init__(self, name: str, image_shape: tuple[int, int, int]) -> None:

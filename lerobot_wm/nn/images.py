@@ -1,19 +1,21 @@
-"""Image augmentation."""
+"""Operations on images: random shifts and resizing."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
+
+_LEVELS = 255  # steps between black and white
 
 
 def random_crop(images: Tensor, pad: int) -> Tensor:
-    """Shift each image by up to `pad` pixels on both axes: pad with its border, crop back at a random place.
+    """Shift each image by up to `pad` pixels on both axes: replicate its border, then crop at a random place.
 
     Args:
         images: (N, C, H, W).
         pad: Pixels of replicated border on every side; PTR and DrQ use 4.
 
     Returns:
-        (N, C, H, W), laid out channels-last in memory. Every image has a shift of its own.
+        (N, C, H, W), channels-last in memory. Each image has its own shift.
     """
     count, _, height, width = images.shape
     padded = F.pad(images, [pad] * 4, mode="replicate")  # (N, C, H + 2·pad, W + 2·pad)
@@ -25,23 +27,20 @@ def random_crop(images: Tensor, pad: int) -> Tensor:
     return crops.permute(0, 3, 1, 2)
 
 
-_LEVELS = 255  # steps between black and white
-
-
 def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
-    """Bring images to another size by antialiased bilinear interpolation; images of this size pass untouched.
+    """Resize images by antialiased bilinear interpolation; images of the right size are returned unchanged.
 
-    The result is rounded to the 256 levels of a camera, so that it can be stored as uint8 and read back without a
-    difference. The aspect ratio is not kept: the whole view is always seen, each axis scaled by itself.
+    The result is rounded to the 256 levels of a camera, so that storing it as uint8 loses nothing. Each axis is scaled
+    by itself: the whole view stays visible, the aspect ratio does not.
 
     Args:
         images: (..., C, H, W) in [0, 1].
         size: (H, W) of the result.
 
     Returns:
-        (..., C, *size) in [0, 1], in 256 levels.
+        (..., C, *size) in [0, 1], in steps of 1/255.
     """
     if images.shape[-2:] == size:
         return images
-    resized = nn.functional.interpolate(images.flatten(0, -4), size=size, mode="bilinear", antialias=True)
+    resized = F.interpolate(images.flatten(0, -4), size=size, mode="bilinear", antialias=True)
     return ((resized * _LEVELS).round() / _LEVELS).unflatten(0, images.shape[:-3])

@@ -11,14 +11,14 @@ from lerobot_wm.nn.fast_cpu import Dropout
 class MLP(nn.Module):
     """Hidden layers with an activation (and dropout) after each, then a linear output layer.
 
-    The output layer runs in float32 even under autocast: the heads built on it (means, log-stds, values,
-    rewards) are compared with targets whose differences are smaller than bfloat16 can hold.
+    The output layer runs in float32 even under autocast: its outputs (actions, values, rewards) are compared with
+    targets that differ by less than bfloat16 can resolve.
 
     Args:
         input_dim: Size of the last axis of the input.
         hidden_dims: Width of each hidden layer.
         output_dim: Size of the last axis of the output.
-        activation: Module class put after every hidden layer.
+        activation: Module class applied after every hidden layer.
         dropout: Probability of zeroing a hidden unit during training; 0 adds no dropout layer.
     """
 
@@ -42,9 +42,9 @@ class MLP(nn.Module):
 
     @torch.no_grad()
     def insert_inputs(self, place: int, count: int) -> None:
-        """Take `count` more inputs from index `place` on, with weights of zero: as yet they change nothing.
+        """Add `count` inputs at index `place`. Their weights are zero, so the output does not change yet.
 
-        The first layer's weight becomes another parameter: optimizers are to be made afterwards.
+        The first layer's weight becomes a new parameter: create the optimizer afterwards.
         """
         first = next(layer for layer in self.modules() if isinstance(layer, nn.Linear))
         before, after = first.weight[:, :place], first.weight[:, place:]

@@ -1,4 +1,4 @@
-"""Affine scalings stored as buffers, so that a checkpoint carries the statistics it was trained with."""
+"""Affine scalings stored as buffers: a checkpoint carries the statistics it was trained with."""
 
 import torch
 from torch import Tensor, nn
@@ -9,8 +9,8 @@ _EPS = 1e-6
 class Affine(nn.Module):
     """x -> (x - offset) / scale per feature, and back.
 
-    Entries whose scale is (nearly) zero are constant in the data: they are only shifted, never blown up, and the way
-    back gives the constant, whatever is asked for. (Checkpoints before 0.2 have a scale of 1 there.)
+    An entry whose scale is (nearly) zero is constant in the data. `forward` only shifts it, and `inverse` returns the
+    constant for any input.
     """
 
     offset: Tensor
@@ -32,16 +32,16 @@ class Affine(nn.Module):
     def _set(self, offset: Tensor, scale: Tensor) -> None:
         if offset.shape != self.offset.shape:
             raise ValueError(
-                f"The dataset's statistics have {tuple(offset.shape)} entries, the model expects "
-                f"{tuple(self.offset.shape)}: recompute the statistics or use the dataset the model was made for."
+                f"The dataset's statistics have the shape {tuple(offset.shape)}, the model expects "
+                f"{tuple(self.offset.shape)}. Recompute the statistics, or use the dataset the model was made for."
             )
         self.offset.copy_(offset)
         self.scale.copy_(torch.where(scale > _EPS, scale, torch.zeros_like(scale)))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalise (..., dim)."""
+        """Normalize x, (..., dim)."""
         return (x - self.offset) / torch.where(self.scale > 0, self.scale, 1.0)
 
     def inverse(self, x: Tensor) -> Tensor:
-        """Undo `forward` on (..., dim)."""
+        """Undo `forward` on x, (..., dim)."""
         return x * self.scale + self.offset

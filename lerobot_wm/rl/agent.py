@@ -22,7 +22,7 @@ class GaussianActor(nn.Module):
         self.log_std = nn.Parameter(torch.zeros(action_dim))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean (B, A), in (-1, 1), and log-std (A,) for observations (B, O)."""
+        """Compute the mean (B, A) in (-1, 1) and the log-std (A,) for observations (B, O)."""
         return self.mlp(observation).tanh(), self.log_std
 
 
@@ -34,7 +34,7 @@ class TwinCritic(nn.Module):
         self.critics = nn.ModuleList(MLP(input_dim, hidden_dims, 1, nn.ReLU) for _ in range(2))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Q values (2, B) for observations (B, O) and actions (B, A)."""
+        """Compute the Q values (2, B) of observations (B, O) and actions (B, A)."""
         x = torch.cat([observation, action], dim=-1)
         return torch.stack([critic(x).squeeze(-1) for critic in self.critics])
 
@@ -42,15 +42,15 @@ class TwinCritic(nn.Module):
 class IQLAgent(nn.Module):
     """Twin critics with Polyak targets, a value function, and one actor per inverse temperature β.
 
-    All losses of a step are taken at the same parameters and descended together: LeRobot's loop makes one
-    backward pass and one optimizer step. The reference updates V before Q uses it; the lag is one step.
+    LeRobot's loop makes one backward pass and one optimizer step, so all losses are computed with the same parameters.
+    The reference implementation updates V before Q uses it; here Q uses the V of the step before.
 
     Args:
         observation_dim: O.
         action_dim: A.
-        betas: β of each actor. IQL learns Q and V without an actor, so that all actors share them. The first is the
-            main one. The others send no gradient into the observations: without dropout, whose masks come from one
-            generator, the main actor's training is bit for bit the same with and without them.
+        betas: β of each actor; the first is the main one. IQL learns Q and V without an actor, so all actors share
+            them. The other actors send no gradient into the observations. Without dropout, whose masks share one random
+            generator, the main actor trains bit for bit the same with and without them.
         hidden_dims: Widths of the hidden layers of every network.
         dropout: Dropout of the actors.
         expectile: τ of the value regression.
@@ -85,21 +85,21 @@ class IQLAgent(nn.Module):
         for network in (self.actors, self.critic, self.value):
             orthogonal_init(network)
         self.target_critic = deepcopy(self.critic).requires_grad_(False)
-        # Made last: they take nothing from the random numbers the networks above are made of.
+        # Created last, so that the networks above get the same random numbers with and without them.
         for _ in self.betas[1:]:
             self.actors.append(make_actor())
         orthogonal_init(self.actors[1:])
 
     def networks(self) -> list[MLP]:
-        """All that read the observation."""
+        """List the networks whose input starts with the observation."""
         return [module for module in self.modules() if isinstance(module, MLP)]
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Three optimizer groups, the actors first: only their learning rate decays."""
+        """Return three optimizer groups. The actors come first: only their learning rate decays."""
         return [{"params": list(network.parameters())} for network in (self.actors, self.critic, self.value)]
 
     def mean_action(self, observation: Tensor, beta: float) -> Tensor:
-        """Mean (B, A) of the actor trained with `beta`, scaled to [-1, 1], for observations (B, O)."""
+        """Compute the mean action (B, A) in [-1, 1] of the actor trained with `beta`, for observations (B, O)."""
         return self.actors[self.betas.index(beta)](observation)[0]
 
     def loss(
@@ -111,22 +111,22 @@ class IQLAgent(nn.Module):
         terminal: Tensor,
         has_next: Tensor,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Value, critic and actor losses on a batch of transitions.
+        """Compute the value, critic and actor losses on a batch of transitions.
 
         Args:
             observation: At t, (B, O). Critic, value and main actor send gradients into it.
-            next_observation: At t+1, (B, O), used without gradient.
+            next_observation: At t+1, (B, O); gets no gradient.
             action: Scaled to [-1, 1], (B, A).
             reward: (B,).
-            terminal: (B,) bool, True where the step ends the task; a time limit does not.
-            has_next: (B,) bool, False where the data ends at t and `next_observation` is no successor.
+            terminal: (B,) bool, True where the step ends the task. A time limit does not.
+            has_next: (B,) bool, False where the data ends at t, so that `next_observation` is not the successor.
 
         Returns:
-            The sum of the losses and its parts by name, each a detached scalar; those of further actors are
+            The sum of the losses, and its parts by name as detached scalars. The losses of further actors are named
             `actor_loss_beta<β>`.
         """
-        # Before the pass without gradient: autocast of PyTorch before 2.11 keeps the weights it casts there, without
-        # their gradient, for this one.
+        # This comes before the pass without gradient: there, autocast before PyTorch 2.11 would cache the cast weights
+        # without gradient and reuse them here.
         v = self.value(observation).squeeze(-1)  # (B,)
         with torch.no_grad():
             target_q = self.target_critic(observation, action).amin(0)  # (B,)
@@ -136,7 +136,7 @@ class IQLAgent(nn.Module):
         advantage = target_q - v  # (B,)
         losses = {
             "value_loss": iql.value_loss(target_q, v, self.expectile),
-            # The last frame of an episode has no successor: without success there it cannot be bootstrapped.
+            # The last frame of an episode has no successor. Unless the task ended there, its target is unknown.
             "critic_loss": iql.critic_loss(qs, target, terminal | has_next),
         }
         for i, (beta, actor) in enumerate(zip(self.betas, self.actors, strict=True)):
@@ -155,6 +155,6 @@ class IQLAgent(nn.Module):
 
     @torch.no_grad()
     def update_target(self) -> None:
-        """Move the target critics towards the critics."""
+        """Move the target critics towards the critics (Polyak averaging)."""
         for target, source in zip(self.target_critic.parameters(), self.critic.parameters(), strict=True):
             target.lerp_(source, self.target_rate)

@@ -12,28 +12,28 @@ LOG_STD_RANGE = (-5.0, 2.0)
 
 
 def expectile_loss(error: Tensor, expectile: float) -> Tensor:
-    """Asymmetric squared error |τ - 1(u < 0)| u², averaged; error is u, (B,)."""
+    """Compute the mean of the asymmetric squared error |τ - 1(u < 0)| u²; error is u, (B,)."""
     weight = (error > 0).float() * (2 * expectile - 1) + (1 - expectile)
     return (weight * error.square()).mean()
 
 
 def value_loss(q: Tensor, v: Tensor, expectile: float) -> Tensor:
-    """Regress V(s) on the τ-expectile of min Q_target(s, a); both (B,)."""
+    """Regress V(s) on the τ-expectile of the smaller target Q(s, a); q and v are (B,)."""
     return expectile_loss(q.detach() - v, expectile)
 
 
 def critic_target(reward: Tensor, next_v: Tensor, terminal: Tensor, discount: float) -> Tensor:
-    """r + γ (1 - terminal) V(s'), all (B,). A time limit is not terminal, success is."""
+    """Compute r + γ (1 - terminal) V(s'), all (B,). Success is terminal, a time limit is not."""
     return reward + discount * (1 - terminal.float()) * next_v.detach()
 
 
 def critic_loss(qs: Tensor, target: Tensor, valid: Tensor) -> Tensor:
-    """Sum over the twin critics of their mean squared errors.
+    """Compute the sum of the two critics' mean squared errors.
 
     Args:
         qs: Q_i(s, a), (2, B).
         target: (B,).
-        valid: (B,) bool, False where the data holds no next observation to bootstrap from.
+        valid: (B,) bool, False where there is no next observation to bootstrap from.
     """
     weight = valid.float()
     squared = (qs - target.detach()).square() * weight  # (2, B)
@@ -41,16 +41,16 @@ def critic_loss(qs: Tensor, target: Tensor, valid: Tensor) -> Tensor:
 
 
 def advantage_weight(advantage: Tensor, beta: float) -> Tensor:
-    """exp(β·A) clipped at 100, (B,), without gradient."""
+    """Compute exp(β·A), clipped at 100, without gradient: (B,)."""
     return (beta * advantage.detach()).exp().clamp(max=MAX_WEIGHT)
 
 
 def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
-    """log N(action; mean, exp(log_std)) summed over the action's axes: (B,).
+    """Compute log N(action; mean, exp(log_std)), summed over the action's axes: (B,).
 
     Args:
-        mean: (B, A). The Gaussian is not squashed: only its mean is bounded by the network. Demonstrated
-            actions sit on the bounds at nearly every step, where a squashed density explodes.
+        mean: (B, A). The network bounds the mean, but the Gaussian is not squashed: demonstrated actions lie on the
+            bounds at nearly every step, where the density of a squashed Gaussian explodes.
         log_std: (A,), clamped to [-5, 2].
         action: (B, A).
     """
@@ -60,5 +60,5 @@ def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
 
 
 def actor_loss(weight: Tensor, log_prob: Tensor) -> Tensor:
-    """Advantage-weighted regression: -mean(weight · log π(a|s)); both (B,)."""
+    """Compute the advantage-weighted regression loss -mean(weight · log π(a|s)); both are (B,)."""
     return -(weight * log_prob).mean()

@@ -16,31 +16,26 @@ class RSSMConfig:
         kl_scale: Weight β of the KL term.
         free_nats: KL per step (nats) below which the KL is not penalised.
         reward_scale: Weight of the reward loss.
-        image_error_weight: w of the image loss e² (1 + w |e|), e in [-1, 1]; 0 is the paper's squared error. Above
-            it, what is small and wrong weighs more.
-        standardize_images: Scale each channel of the images by the dataset's mean and standard deviation where they
-            enter and leave the model; the loss stays in [0, 1]. Off, as in the paper, the model first has to learn what
-            the mean image is.
-        decode_share: Share of each window's frames that are reconstructed, drawn anew in each step. More than half of a
-            step goes into the decoder: with a fifth of the frames a CPU core makes almost twice as many steps.
-        action_dropout: Share of the training windows in which the recurrence is not told the actions. Above 0 it is
-            never told them where it filters. A demonstrator's action tells where the goal is as well as the image does:
-            a model that is always told it has no reason to look, and a policy on its latents copies its own last
-            action. Imagination is told the actions in any case; at 1 nothing was learned of what they do.
-        action_scale: Weight of the action loss: a head predicts a_t from s_t, so that s_t holds what the demonstrator
-            acted on, however small it is in the image. 0: no such head.
-        image_shift: Pixels by which each training frame is shifted at random, up or down and left or right, before it
-            is encoded; what is reconstructed is not shifted. Demonstrations of few goals can be told apart by what
-            else is in the image, to the pixel; once that moves, the goal has to be located. Not for actions that are
-            places in a fixed camera's image: the shift moves the place and not the action.
-        predict_reward: Whether there is a reward head (turned off for datasets without `next.reward`).
-        use_proprio: Encode and reconstruct proprioception beside the image (the paper's discarded variant).
-        centred_start: What stands for the action before an episode is the middle of the actions' range. Filled when a
-            model is made new; those of release 0.1.0 were trained with zeros in the dataset's units, which for joint
-            angles may be far from all that the robot was ever told.
-        image_channels: Channels of the image; filled from the dataset.
-        action_dim: Size of the action; filled from the dataset.
-        proprio_dim: Size of the proprioceptive state; filled from the dataset when `use_proprio`.
+        standardize_images: Scale each image channel by the dataset's mean and standard deviation at the model's input
+            and output; the loss is still computed on [0, 1]. Without it, as in the paper, the model first has to learn
+            the mean image.
+        decode_share: Share of each window's frames that are reconstructed, drawn again at each step. The decoder takes
+            more than half of a step: with a share of 0.2 a CPU core makes almost twice as many steps.
+        hidden_action_share: Share of the training windows in which the filter is not given the previous actions. Above
+            0 the filter never gets them at test time. A demonstrator's action reveals the goal as well as the image
+            does: a model that always gets it has no reason to look, and a policy on its latents copies its own last
+            action. Imagination always gets the actions; with a share of 1 it learned nothing about them.
+        action_scale: Weight of the action loss. A head predicts a_t from s_t, so that s_t holds what the demonstrator
+            reacted to, however small it is in the image. 0 removes the head.
+        image_shift: Largest random shift of a training frame before it is encoded, in pixels; the reconstruction target
+            is not shifted. With demonstrations of few goals, the model could recognize each one by its exact pixels;
+            under shifts it has to locate the goal. Not for actions that are positions in a fixed camera's image: the
+            shift would move the position but not the action.
+        predict_reward: Whether there is a reward head. Turned off for datasets without a reward.
+        use_proprio: Encode and reconstruct proprioception beside the image (the variant that the paper discarded).
+        image_channels: Channels of the image. Set from the dataset.
+        action_dim: Size of the action. Set from the dataset.
+        proprio_dim: Size of the proprioceptive state. Set from the dataset when `use_proprio`.
     """
 
     deter_dim: int = 256
@@ -51,35 +46,27 @@ class RSSMConfig:
     kl_scale: float = 1.0
     free_nats: float = 3.0
     reward_scale: float = 1.0
-    image_error_weight: float = 0.0
     standardize_images: bool = False
     decode_share: float = 1.0
-    action_dropout: float = 0.0
+    hidden_action_share: float = 0.0
     action_scale: float = 0.0
     image_shift: int = 0
     predict_reward: bool = True
     use_proprio: bool = False
-    centred_start: bool = False
     image_channels: int = 0
     action_dim: int = 0
     proprio_dim: int = 0
 
     def __post_init__(self) -> None:
         if not 0 < self.decode_share <= 1:
-            raise ValueError(
-                f"decode_share is {self.decode_share:g}; a share of frames is above 0 and at most 1."
-            )
-        if self.image_shift < 0:
-            raise ValueError(f"image_shift is {self.image_shift}; it is pixels, 0 or more.")
-        if not 0 <= self.action_dropout <= 1:
-            raise ValueError(
-                f"action_dropout is {self.action_dropout:g}; a share of windows is between 0 and 1."
-            )
+            raise ValueError(f"decode_share is {self.decode_share:g}; expected above 0 and at most 1.")
+        if not 0 <= self.hidden_action_share <= 1:
+            raise ValueError(f"hidden_action_share is {self.hidden_action_share:g}; expected 0 to 1.")
         if self.min_std <= 0:
-            raise ValueError(f"min_std is {self.min_std:g}; a standard deviation is above 0.")
-        for name in ("kl_scale", "free_nats", "reward_scale", "image_error_weight", "action_scale"):
+            raise ValueError(f"min_std is {self.min_std:g}; expected a standard deviation above 0.")
+        for name in ("kl_scale", "free_nats", "reward_scale", "action_scale", "image_shift"):
             if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name):g}; it is 0 or more.")
+                raise ValueError(f"{name} is {getattr(self, name):g}; expected 0 or more.")
 
     @property
     def latent_dim(self) -> int:

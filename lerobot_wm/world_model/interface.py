@@ -1,4 +1,4 @@
-"""What a world model has to offer to be trained as one, encode datasets and be acted on: subclass `LatentModel`."""
+"""The interface of a world model: subclass `LatentModel` to train, encode and act with your own."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class LatentState(Protocol):
 
 @dataclass(frozen=True)
 class PlainState:
-    """A state that is its latent and nothing else, (B, L) or (B, T, L)."""
+    """A state that consists of its latent alone, (B, L) or (B, T, L)."""
 
     latent: Tensor
 
@@ -30,42 +30,42 @@ class PlainState:
 
 
 class LatentModel(nn.Module, ABC):
-    """A world model, or what stands in its place: images and actions in, latent states out.
+    """A model that turns images and actions into latent states.
 
-    Whole episodes are encoded by `embed` and then `filter_embeds`, a running episode frame by frame by `observe`: the
-    latents must be the same. Images are (B, T, C, H, W) in [0, 1], several cameras stacked along channels; actions
-    (B, T, A) and proprioception (B, T, P) are in the dataset's units. A model ignores what it does not read.
+    A recorded episode is encoded by `embed`, then `filter_embeds`. A running episode is encoded frame by frame by
+    `observe`. Both must give the same latents. Images are (B, T, C, H, W) in [0, 1], with several cameras stacked along
+    channels. Actions (B, T, A) and proprioception (B, T, P) are in the dataset's units. A model may ignore any of them.
     """
 
     @property
     def encoding_settings(self) -> dict[str, Any]:
-        """What decides the latents of an image beside the weights; latents of other settings are another model's."""
+        """Settings that change the latents although the weights stay the same; they are part of the fingerprint."""
         return {}
 
     @abstractmethod
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
-        """Embeddings e_t, each of its own frame alone: (B, T, E)."""
+        """Compute the embeddings e_t, each from its own frame alone: (B, T, E)."""
 
     @abstractmethod
     def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> LatentState:
-        """States (B, T, ·) for embeddings of whole episodes, given the action a_t executed at each frame.
+        """Compute the states (B, T, ·) of whole episodes from embeddings and the action a_t executed at each frame.
 
-        s_t may depend on a_{t-1} and what came before, never on a_t. `sample` draws it where the model has a
-        distribution, instead of taking the mean.
+        s_t may depend on a_{t-1} and earlier actions, never on a_t. With `sample`, a stochastic state is drawn from its
+        distribution; otherwise it is the mean.
         """
 
     @abstractmethod
     def observe(
         self, images: Tensor, prev_actions: Tensor, state: Any = None, proprio: Tensor | None = None
     ) -> LatentState:
-        """States (B, T, ·) for the next frames, given the action a_{t-1} before each and the state before the first.
+        """Compute the states (B, T, ·) of the next frames from a_{t-1} before each and the state before the first.
 
-        Where an episode starts, the state is None and the action, which nobody took, is zeros that mean nothing.
+        At the start of an episode `state` is None, and the first previous action is a placeholder of zeros.
         """
 
     def expected_images(self, state: Any) -> Tensor:
-        """What o_t was expected to be before it was seen, (B, C, H, W), by the state s_t (B, ·) it led to.
+        """Predict o_t from everything before it, (B, C, H, W), given the state s_t (B, ·) after it.
 
-        Defined where the configuration says `predicts_images`.
+        Needed only if the configuration sets `predicts_images`.
         """
         raise NotImplementedError(f"{type(self).__name__} predicts no images.")

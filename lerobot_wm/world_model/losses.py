@@ -5,21 +5,13 @@ from torch import Tensor
 from lerobot_wm.world_model.config import RSSMConfig
 
 
-def reconstruction_loss(prediction: Tensor, target: Tensor, error_weight: float = 0.0) -> Tensor:
-    """Squared error e² (1 + w |e|) summed over everything but batch and time: (B, T, ...) -> (B, T), in float32.
-
-    With w = `error_weight` above zero large errors count for more than their square: a few pixels that are wholly
-    wrong, such as a small object left out, stand up against many that are slightly off.
-    """
-    error = prediction.float() - target.float()
-    squared = error.square()
-    if error_weight > 0:
-        squared = squared * (1 + error_weight * error.abs())
-    return squared.flatten(2).sum(-1)
+def reconstruction_loss(prediction: Tensor, target: Tensor) -> Tensor:
+    """Squared error summed over everything but batch and time: (B, T, ...) -> (B, T), in float32."""
+    return (prediction.float() - target.float()).square().flatten(2).sum(-1)
 
 
 def masked_mean(values: Tensor, valid: Tensor) -> Tensor:
-    """Mean of (B, T) values where `valid` holds."""
+    """Mean of the values (B, T) where `valid` (B, T) is true."""
     weight = valid.to(values.dtype)
     return (values * weight).sum() / weight.sum().clamp(min=1)
 
@@ -27,17 +19,17 @@ def masked_mean(values: Tensor, valid: Tensor) -> Tensor:
 def world_model_loss(
     errors: dict[str, Tensor], kl: Tensor, valid: Tensor, config: RSSMConfig
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Sum of the reconstruction terms and the KL, clamped per step at the free nats (as TorchRL's Dreamer).
+    """Sum of the reconstruction terms and the KL, which is clamped per step at the free nats (as in TorchRL's Dreamer).
 
     Args:
         errors: Per-step terms, each (B, T): `image_loss`; `reward_loss`, `action_loss`, `proprio_loss` if modelled.
         kl: KL(posterior || prior) in nats, (B, T).
-        valid: (B, T) bool; steps that count.
-        config: Weights β (`kl_scale`), `reward_scale` and `action_scale`, and `free_nats`.
+        valid: (B, T) bool, True for the steps that count.
+        config: Gives the weights β (`kl_scale`), `reward_scale` and `action_scale`, and `free_nats`.
 
     Returns:
-        The scalar loss and the named parts (detached scalars), the unclamped KL and the share of steps under
-        the free nats among them.
+        The scalar loss, and its parts by name as detached scalars. Among them are the unclamped KL and the share of
+        steps below the free nats.
     """
     scales = {
         "image_loss": 1.0,

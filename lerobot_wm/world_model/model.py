@@ -17,14 +17,14 @@ from lerobot_wm.world_model.rssm import RSSM, DiagonalNormal, RSSMState
 
 
 class WorldModel(LatentModel):
-    """An RSSM on images and actions only: no task id, and no proprioception unless `config.use_proprio`.
+    """An RSSM on images and actions: no task id, and no proprioception unless `config.use_proprio`.
 
-    Time: frame t holds the image o_t, the action a_t executed there and the reward r_t that arrives with
-    o_{t+1}. The filter reads (s_{t-1}, a_{t-1}, o_t); a_{-1}, which nobody took, is the middle of the actions' range
-    (`config.centred_start`). The reward head predicts r_{t-1} from s_t.
+    Time: frame t holds the image o_t, the action a_t executed there and the reward r_t that arrives with o_{t+1}. The
+    filter reads (s_{t-1}, a_{t-1}, o_t). Before the first frame of an episode, a_{-1} is the middle of the actions'
+    range. The reward head predicts r_{t-1} from s_t.
 
-    Actions, proprioception and images enter in the dataset's own units; `action_scaling`, `proprio_scaling` and
-    `image_scaling` hold the statistics that normalise them, so that a checkpoint needs nothing beside itself.
+    Actions, proprioception and images enter in the dataset's units. `action_scaling`, `proprio_scaling` and
+    `image_scaling` hold the statistics that normalize them, so a checkpoint is complete by itself.
     """
 
     def __init__(self, config: RSSMConfig) -> None:
@@ -47,11 +47,11 @@ class WorldModel(LatentModel):
 
     @property
     def encoding_settings(self) -> dict[str, Any]:
-        """Whether the filter is told the actions."""
-        return {"hidden_actions": True} if self.config.action_dropout > 0 else {}
+        """Whether the filter is given the actions."""
+        return {"hidden_actions": True} if self.config.hidden_action_share > 0 else {}
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
-        """Image embeddings e_t.
+        """Compute the image embeddings e_t.
 
         Args:
             images: (B, T, C, 64, 64) in [0, 1].
@@ -75,11 +75,11 @@ class WorldModel(LatentModel):
         state: RSSMState | None = None,
         proprio: Tensor | None = None,
     ) -> RSSMState:
-        """Filter (B, T) frames given the action before each: the streaming form, resumed from `state`.
+        """Filter the next frames of a running episode, given the action before each.
 
         Args:
             images: o_t, (B, T, C, 64, 64) in [0, 1].
-            prev_actions: a_{t-1}, (B, T, A) in the dataset's units; the first is not read where an episode starts.
+            prev_actions: a_{t-1}, (B, T, A) in the dataset's units. At the start of an episode the first is ignored.
             state: s before the first frame, (B, ·); None starts an episode.
             proprio: (B, T, P), with `config.use_proprio`.
 
@@ -90,11 +90,11 @@ class WorldModel(LatentModel):
         return self._observe(embeds, self.action_scaling(prev_actions), state)[0]
 
     def filter(self, images: Tensor, actions: Tensor, proprio: Tensor | None = None) -> RSSMState:
-        """Filter whole episodes: as `observe`, given the action executed *at* each frame.
+        """Filter whole episodes, given the action executed *at* each frame.
 
         Args:
             images: o_t, (B, T, C, 64, 64) in [0, 1], from an episode's first frame on.
-            actions: a_t, (B, T, A); the last is not used.
+            actions: a_t, (B, T, A) in the dataset's units. The last one is ignored.
             proprio: (B, T, P), with `config.use_proprio`.
 
         Returns:
@@ -103,35 +103,35 @@ class WorldModel(LatentModel):
         return self.filter_embeds(self.embed(images, proprio), actions)
 
     def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> RSSMState:
-        """`filter` for images that are embedded already: embeds (B, T, 1024), actions a_t (B, T, A).
+        """Filter whole episodes from their embeddings (B, T, 1024) and actions a_t (B, T, A).
 
-        With `sample` z_t is drawn.
+        z_t is the posterior mean, or drawn from the posterior with `sample`.
         """
-        return self._observe(embeds, self._shift(actions), sample=sample)[0]
+        return self._observe(embeds, self._previous_actions(actions), sample=sample)[0]
 
     def filter_with_kl(self, embeds: Tensor, actions: Tensor) -> tuple[RSSMState, Tensor]:
-        """`filter_embeds`, and how far each image moved the belief: KL(posterior || prior) in nats, (B, T)."""
-        states, posterior = self._observe(embeds, self._shift(actions))
+        """Filter as `filter_embeds` does; also return KL(posterior || prior) in nats, (B, T)."""
+        states, posterior = self._observe(embeds, self._previous_actions(actions))
         return states, posterior.kl(self.rssm.prior(states.deter))
 
     def imagine(self, state: RSSMState, actions: Tensor) -> RSSMState:
-        """Predict s_{t+1} ... s_{t+H}, z at the prior's mean, from s_t (B, ·) under a_t ... a_{t+H-1}, (B, H, A)."""
+        """Predict s_{t+1} ... s_{t+H} from s_t (B, ·) and a_t ... a_{t+H-1} (B, H, A); z is the prior's mean."""
         return self.rssm.imagine(state, self.action_scaling(actions))
 
     def decode(self, latents: Tensor) -> Tensor:
-        """Images (..., C, 64, 64), clipped to [0, 1], from latents (..., D+S)."""
+        """Decode latents (..., D+S) to images (..., C, 64, 64), clipped to [0, 1]."""
         return self._decode(latents).clamp(0, 1)
 
     def expected_images(self, state: RSSMState) -> Tensor:
-        """What o_t was expected to be before it was seen: (B, C, 64, 64) for the s_t (B, ·) it led to.
+        """Predict o_t (B, C, 64, 64) from s_{t-1} and a_{t-1}, given the state s_t (B, ·) after it.
 
-        From s_{t-1} and a_{t-1} alone; with `action_dropout` above 0 the filter is not told a_{t-1} either.
+        With `hidden_action_share` above 0 the prediction does not know a_{t-1}.
         """
-        # d_t does not depend on o_t; z_t as expected without it is the prior's.
+        # d_t does not depend on o_t, and the prior predicts z_t without it.
         return self.decode(RSSMState(state.deter, self.rssm.prior(state.deter).mean).latent)
 
     def predict_reward(self, latents: Tensor) -> Tensor:
-        """The reward r_{t-1} that arrived with frame t, (...), from latents s_t (..., D+S)."""
+        """Predict the reward r_{t-1} that arrived with frame t, (...), from latents s_t (..., D+S)."""
         return self.reward_head(latents).squeeze(-1)
 
     def loss(
@@ -142,27 +142,26 @@ class WorldModel(LatentModel):
         rewards: Tensor | None = None,
         proprio: Tensor | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The training loss on windows: reconstruction, reward, action, and KL with free nats.
+        """Compute the training loss on windows: reconstruction, reward, action, and KL with free nats.
 
-        A window starts from the zero state and, for the previous action, the middle of their range (zeros
-        without `config.centred_start`), wherever in its episode it lies. The reward
-        loss is averaged over all T frames, though the first has none: it weighs (T-1)/T of `reward_scale`.
+        A window starts from the zero state, wherever it lies in its episode. The reward loss is averaged over all T
+        frames although the first has none, so its weight is (T-1)/T of `reward_scale`.
 
         Args:
             images: (B, T, C, 64, 64) in [0, 1].
-            actions: a_t, (B, T, A).
+            actions: a_t, (B, T, A) in the dataset's units.
             valid: (B, T) bool, False where a window runs past the end of its episode.
             rewards: r_t, (B, T); needed with `config.predict_reward`.
             proprio: (B, T, P); needed with `config.use_proprio`.
 
         Returns:
-            The scalar loss and its parts by name, each a detached scalar.
+            The scalar loss, and its parts by name as detached scalars.
         """
-        embeds = self.embed(self._jitter(images), proprio)
-        states, posterior = self._observe(embeds, self._shift(actions), sample=True)
+        embeds = self.embed(self._shift_images(images), proprio)
+        states, posterior = self._observe(embeds, self._previous_actions(actions), sample=True)
         prior = self.rssm.prior(states.deter)
         latents = states.latent  # (B, T, D+S)
-        # Before the action head observes again: compiled for a GPU, that may write where the posterior lies.
+        # Computed before the action head filters again: compiled for a GPU, that call may overwrite the posterior.
         kl = posterior.kl(prior)  # (B, T)
 
         errors = {"image_loss": self._image_loss(latents, images)}
@@ -179,35 +178,35 @@ class WorldModel(LatentModel):
         return world_model_loss(errors, kl, valid, self.config)
 
     def _decode(self, latents: Tensor) -> Tensor:
-        """Images (..., C, 64, 64) in float32, not clipped, from latents (..., D+S)."""
+        """Decode latents (..., D+S) to images (..., C, 64, 64) in float32, not clipped."""
         images = self.decoder(latents.flatten(0, -2)).float()
         if self.config.standardize_images:
             images = self.image_scaling.inverse(images.movedim(-3, -1)).movedim(-1, -3)
         return images.unflatten(0, latents.shape[:-1])
 
     def _image_loss(self, latents: Tensor, images: Tensor) -> Tensor:
-        """Error of images (B, T, C, 64, 64) decoded from s_t, (B, T).
+        """Compute the error (B, T) of the images (B, T, C, 64, 64) decoded from latents (B, T, D+S).
 
-        In training with `decode_share` below 1 that of a few frames of each window, weighted so that its mean over
-        many draws is the mean of them all; the others' is 0.
+        In training with `decode_share` below 1, only some frames of each window are decoded. Their errors are scaled
+        up so that the expected mean stays the same; the other frames have an error of 0.
         """
         windows, length = latents.shape[:2]
-        weight = self.config.image_error_weight
         few = math.ceil(self.config.decode_share * length)
         if few == length or not self.training:
-            return reconstruction_loss(self._decode(latents), images, weight)
-        window = torch.arange(windows, device=images.device)[:, None]
+            return reconstruction_loss(self._decode(latents), images)
+        window = torch.arange(windows, device=images.device)[:, None]  # (B, 1)
         frame = torch.rand(windows, length, device=images.device).argsort(1)[:, :few]  # (B, few)
-        decoded = self._decode(latents[window, frame])
-        error = reconstruction_loss(decoded, images[window, frame], weight)  # (B, few)
+        decoded = self._decode(latents[window, frame])  # (B, few, C, 64, 64)
+        error = reconstruction_loss(decoded, images[window, frame])  # (B, few)
         return error.new_zeros(windows, length).scatter(1, frame, error * length / few)
 
     def _action_loss(self, embeds: Tensor, latents: Tensor, actions: Tensor) -> Tensor:
-        """Error of scaled actions a_t (B, T, A) read from s_t, and from what s_t is of o_t alone: (B, T).
+        """Compute the error (B, T) of scaled actions a_t (B, T, A), predicted from s_t and from frame t alone.
 
-        A demonstrator's next action is much like the last one, which memory tells; one frame alone has to be looked at.
+        A demonstrator's next action resembles the last one, which the memory holds. A single frame has no memory: to
+        predict the action from it, the encoder has to look.
         """
-        frames = embeds.flatten(0, 1).unsqueeze(1)  # (B * T, 1, E): each the first of an episode
+        frames = embeds.flatten(0, 1).unsqueeze(1)  # (B·T, 1, E), each as the first frame of an episode
         unknown = frames.new_zeros(len(frames), 1, self.config.action_dim)
         alone = self.rssm.observe(frames, unknown, self.rssm.initial_state(len(frames)), sample=True)[0]
         from_memory, from_frame = (
@@ -216,8 +215,8 @@ class WorldModel(LatentModel):
         )
         return 0.5 * (from_memory + from_frame)
 
-    def _jitter(self, images: Tensor) -> Tensor:
-        """Images (B, T, C, 64, 64), in training each frame shifted by up to `image_shift` pixels."""
+    def _shift_images(self, images: Tensor) -> Tensor:
+        """Shift each frame of images (B, T, C, 64, 64) by up to `image_shift` pixels, in training only."""
         if self.config.image_shift == 0 or not self.training:
             return images
         return random_crop(images.flatten(0, 1), self.config.image_shift).unflatten(0, images.shape[:2])
@@ -225,23 +224,23 @@ class WorldModel(LatentModel):
     def _observe(
         self, embeds: Tensor, prev_actions: Tensor, state: RSSMState | None = None, *, sample: bool = False
     ) -> tuple[RSSMState, DiagonalNormal]:
-        """The RSSM's `observe`, from scaled actions a_{t-1} (B, T, A) as far as it is told them; None starts anew."""
+        """Run the RSSM's filter on scaled actions a_{t-1} (B, T, A); a state of None starts an episode."""
         if state is None:
             state = self.rssm.initial_state(embeds.shape[0])
-            if self.config.centred_start:
-                prev_actions = nn.functional.pad(prev_actions[:, 1:], (0, 0, 1, 0))
-        return self.rssm.observe(embeds, self._told(prev_actions), state, sample=sample)
+            # Zero is the middle of the scaled actions' range.
+            prev_actions = nn.functional.pad(prev_actions[:, 1:], (0, 0, 1, 0))
+        return self.rssm.observe(embeds, self._hide(prev_actions), state, sample=sample)
 
-    def _told(self, prev_actions: Tensor) -> Tensor:
-        """What the recurrence is told of scaled actions a_{t-1} (B, T, A): zeros where they are hidden."""
-        share = self.config.action_dropout
+    def _hide(self, prev_actions: Tensor) -> Tensor:
+        """Replace scaled actions a_{t-1} (B, T, A) by zeros where the filter is not given them."""
+        share = self.config.hidden_action_share
         if share == 0:
             return prev_actions
         if not self.training:
             return torch.zeros_like(prev_actions)
-        told = torch.rand(len(prev_actions), 1, 1, device=prev_actions.device) >= share  # (B, 1, 1)
-        return prev_actions * told
+        given = torch.rand(len(prev_actions), 1, 1, device=prev_actions.device) >= share  # (B, 1, 1)
+        return prev_actions * given
 
-    def _shift(self, actions: Tensor) -> Tensor:
-        """a_t (B, T, A) -> scaled a_{t-1}, with a zero action (in the dataset's units) before the first frame."""
+    def _previous_actions(self, actions: Tensor) -> Tensor:
+        """Turn a_t (B, T, A) into scaled a_{t-1}; the entry before the first frame is a placeholder."""
         return self.action_scaling(nn.functional.pad(actions[:, :-1], (0, 0, 1, 0)))

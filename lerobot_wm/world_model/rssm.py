@@ -51,7 +51,7 @@ class DiagonalNormal:
 
 
 class RSSM(nn.Module):
-    """Deterministic path, prior and posterior. All of it runs in float32: it is a few percent of the time."""
+    """Deterministic path, prior and posterior. It all runs in float32, at a few percent of the training time."""
 
     def __init__(self, config: RSSMConfig, embed_dim: int) -> None:
         super().__init__()
@@ -65,14 +65,14 @@ class RSSM(nn.Module):
         self.posterior_params = nn.Linear(hidden, 2 * stoch)
 
     def initial_state(self, batch_size: int) -> RSSMState:
-        """The all-zero state every sequence starts from, (B, ·)."""
+        """Make the all-zero state from which every sequence starts, (B, ·)."""
         zeros = self.prior_params.weight.new_zeros
         return RSSMState(zeros(batch_size, self.deter_dim), zeros(batch_size, self.stoch_dim))
 
     def observe(
         self, embeds: Tensor, prev_actions: Tensor, state: RSSMState, *, sample: bool
     ) -> tuple[RSSMState, DiagonalNormal]:
-        """Filter a sequence: the posterior state at each step given images and actions up to it.
+        """Filter a sequence: compute the posterior state of each step from the images and actions up to it.
 
         Args:
             embeds: Image embeddings e_t, (B, T, E).
@@ -84,19 +84,15 @@ class RSSM(nn.Module):
             The states (B, T, ·) and the posterior of each step, (B, T, S).
         """
         with torch.autocast(embeds.device.type, enabled=False):
-            # The parts of both linear layers that do not depend on the recurrence, for all T at once.
-            embeds, prev_actions = embeds.float(), prev_actions.float()
-            z_weight, a_weight = self.recurrent_input.weight.split(
-                [self.stoch_dim, prev_actions.shape[-1]], 1
-            )
+            # What does not depend on the recurrence is computed for all T at once.
+            from_action = self._action_input(prev_actions)  # (B, T, H)
             d_weight, e_weight = self.posterior_hidden.weight.split([self.deter_dim, embeds.shape[-1]], 1)
-            from_action = F.linear(prev_actions, a_weight, self.recurrent_input.bias)  # (B, T, H)
-            from_embed = F.linear(embeds, e_weight, self.posterior_hidden.bias)  # (B, T, H)
+            from_embed = F.linear(embeds.float(), e_weight, self.posterior_hidden.bias)  # (B, T, H)
 
             d, z = state.deter, state.stoch
             deters, stochs, means, stds = [], [], [], []
             for step_action, step_embed in zip(from_action.unbind(1), from_embed.unbind(1), strict=True):
-                d = self.gru(F.elu(F.linear(z, z_weight) + step_action), d)  # (B, D)
+                d = self._advance(d, z, step_action)  # (B, D)
                 hidden = F.elu(F.linear(d, d_weight) + step_embed)  # (B, H)
                 posterior = self._normal(self.posterior_params(hidden))  # (B, S)
                 z = posterior.mean
@@ -110,12 +106,12 @@ class RSSM(nn.Module):
             return states, DiagonalNormal(torch.stack(means, 1), torch.stack(stds, 1))
 
     def prior(self, deter: Tensor) -> DiagonalNormal:
-        """The distribution of z_t before o_t is seen; deter is d_t, (..., D)."""
+        """Predict the distribution of z_t before o_t is seen; deter is d_t, (..., D)."""
         with torch.autocast(deter.device.type, enabled=False):
             return self._normal(self.prior_params(F.elu(self.prior_hidden(deter))))
 
     def imagine(self, state: RSSMState, actions: Tensor) -> RSSMState:
-        """Roll the prior forward without images; z is its mean.
+        """Roll the prior forward without images; z_t is the prior's mean.
 
         Args:
             state: s_t, (B, ·).
@@ -127,12 +123,22 @@ class RSSM(nn.Module):
         d, z = state.deter, state.stoch
         deters, stochs = [], []
         with torch.autocast(actions.device.type, enabled=False):
-            for action in actions.float().unbind(1):
-                d = self.gru(F.elu(self.recurrent_input(torch.cat([z, action], -1))), d)  # (B, D)
+            for step_action in self._action_input(actions).unbind(1):
+                d = self._advance(d, z, step_action)  # (B, D)
                 z = self.prior(d).mean  # (B, S)
                 deters.append(d)
                 stochs.append(z)
         return RSSMState(torch.stack(deters, 1), torch.stack(stochs, 1))
+
+    def _action_input(self, actions: Tensor) -> Tensor:
+        """Project actions (B, T, A) to their part of the GRU's input, (B, T, H)."""
+        a_weight = self.recurrent_input.weight[:, self.stoch_dim :]  # (H, A)
+        return F.linear(actions.float(), a_weight, self.recurrent_input.bias)
+
+    def _advance(self, deter: Tensor, stoch: Tensor, from_action: Tensor) -> Tensor:
+        """Compute d_t (B, D) from d_{t-1} (B, D), z_{t-1} (B, S) and the projected a_{t-1} (B, H)."""
+        z_weight = self.recurrent_input.weight[:, : self.stoch_dim]  # (H, S)
+        return self.gru(F.elu(F.linear(stoch, z_weight) + from_action), deter)
 
     def _normal(self, params: Tensor) -> DiagonalNormal:
         mean, std = params.chunk(2, dim=-1)

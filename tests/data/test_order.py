@@ -55,21 +55,6 @@ def test_same_batches() -> None:
         assert list(faster) == list(theirs.batch_sampler)
 
 
-@pytest.mark.parametrize("size", [4, 20])
-def test_the_last_batch_is_filled_up_with_the_first_samples(size: int) -> None:
-    """Also where an epoch was begun in its middle, and where one is less than a batch."""
-    dataset = TensorDataset(torch.arange(13))
-    started, resumed, order = sampler(), sampler(), list(sampler())
-    resumed.load_state_dict({"epoch": 0, "start_index": 4})
-    loaders = [DataLoader(dataset, batch_size=size, sampler=each) for each in (started, resumed)]
-    whole, rest = (list(batches_of_rows(loader, fill=True)) for loader in loaders)
-    assert [row for batch in whole for row in batch] == (order * 3)[: len(whole) * size]
-    assert {len(batch) for batch in whole} == {size}
-    assert len(batches_of_rows(loaders[0], fill=True)) == len(whole)
-    if size == 4:
-        assert rest == whole[1:]
-
-
 def test_other_samplers_are_left_alone() -> None:
     dataset = TensorDataset(torch.arange(13))
     for loader in (

@@ -63,11 +63,10 @@ def test_before_the_first_checkpoint(processes: Commands, inputs: Inputs, tmp_pa
     command = f"{inputs.command('train', tmp_path / 'run')} --steps=3000 --save_freq=3000"
     ended = processes.start(command).interrupt_when((tmp_path / "run" / "train_log.jsonl").exists)
     check_interrupted(ended)
-    advice = f"there is no checkpoint yet: remove {tmp_path / 'run'} and give the same command again."
-    assert ended.last_line == f"lerobot-wm train: interrupted; {advice}"
+    assert f"remove {tmp_path / 'run'}" in ended.last_line
     refused = processes.run(command)
     assert refused.code == 1
-    assert "is there already: choose another --output_dir, or there is no checkpoint yet" in refused.last_line
+    assert str(tmp_path / "run") in refused.last_line
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ GROWTH = 0.05  # of memory
 @pytest.mark.slow
 def test_nothing_grows(tmp_path: Path) -> None:
     output = tmp_path / "long_run.json"
-    script = ROOT / "scripts" / "long_run.py"
+    script = ROOT / "results" / "faults" / "long_run.py"
     subprocess.run([sys.executable, str(script), f"--output={output}"], check=True)
     check(output)
 

@@ -144,9 +144,7 @@ UNUSUAL_POLICIES = {
         lr_decay_share=0.2,
         compile_model=True,
         reward_key="next.success",
-        rssm=RSSMConfig(
-            free_nats=1e-9, predict_reward=False, action_dim=4, image_channels=3, centred_start=True
-        ),
+        rssm=RSSMConfig(free_nats=1e-9, predict_reward=False, action_dim=4, image_channels=3),
     ),
     "wm_bc": WMBCConfig(
         device="cpu",
@@ -186,7 +184,6 @@ def test_the_command_is_read_as_the_run_that_was(
     # Filled in when the policy is made.
     if policy == "wm_rssm":
         again.policy.rssm.action_dim, again.policy.rssm.image_channels = 4, 3
-        again.policy.rssm.centred_start = True
     if policy == "wm_bc":
         again.policy.tasks = TASKS
     assert what_matters(again) == what_matters(saved)

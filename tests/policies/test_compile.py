@@ -51,11 +51,9 @@ def check_equal(weights: dict[str, dict[str, torch.Tensor]]) -> None:
         torch.testing.assert_close(weights["true"][name], plain, rtol=1e-3, atol=1e-5, msg=name)
 
 
-@pytest.mark.parametrize("updates", [1, 2])
 @pytest.mark.parametrize("policy_type", ["wm_bc", "wm_iql"])
 def test_a_compiled_policy_learns_as_a_plain_one(
     policy_type: str,
-    updates: int,
     latents_root: Path,
     world_model_path: Path,
     tmp_path: Path,
@@ -66,7 +64,6 @@ def test_a_compiled_policy_learns_as_a_plain_one(
         lerobot_wm_command,
         tmp_path,
         f"--policy.type={policy_type} --policy.world_model_path={world_model_path} --policy.hidden_dims=[16,16]",
-        f"--policy.updates_per_step={updates}",
         f"--dataset.repo_id=test/latents --dataset.root={latents_root}",
     )
     assert compilations == ["loss"]

@@ -35,7 +35,6 @@ class WMRSSMPolicy(WorldModelPolicy):
             config.rssm.action_dim = config.rssm.image_channels = config.rssm.proprio_dim = 0
         made_new = config.rssm.action_dim == 0
         super().__init__(config, dataset_stats, dataset_meta)
-        config.rssm.centred_start |= made_new
         self._learns_reward = config.rssm.predict_reward
         if dataset_meta is not None:  # to be trained
             config.fit_windows(min(dataset_meta.episodes["length"]))
