@@ -80,9 +80,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--quality", action="store_true", help="also measure the world model's quality (lerobot-wm quality)"
     )
-    parser.add_argument(
-        "--list", action="store_true", help="print the stages and their state, and exit; writes nothing"
-    )
+    parser.add_argument("--list", action="store_true", help="only print the stages and their state")
     return parser
 
 
