@@ -16,7 +16,6 @@ from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.report.arms import ARMS
 from lerobot_wm.system import usable_cores
 
-
 # Lines of a failed stage's log that are shown.
 LOG_TAIL = 15
 
