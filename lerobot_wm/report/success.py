@@ -164,8 +164,8 @@ def _bootstrap_notes(single: list[str], n_arms: int) -> list[str]:
         )
     if single:
         notes.append(
-            f"Arms with one seed ({', '.join(single)}): its variations are resampled within each task, so the interval "
-            "covers the choice of variations, not training seeds."
+            f"Arms with one seed ({', '.join(single)}): their variations are resampled within each task, so the "
+            "interval covers the choice of variations, not training seeds."
         )
     return notes
 
