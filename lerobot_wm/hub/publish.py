@@ -18,7 +18,7 @@ from PIL import Image
 from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.source import dataset_folder
 from lerobot_wm.hub.errors import check_can_push
-from lerobot_wm.inspect.episodes import check_features, load_world_model
+from lerobot_wm.inspect.episodes import CheckpointConfig, check_features, load_world_model
 from lerobot_wm.inspect.open_loop import CONTEXT, OpenLoop, open_loop, psnr_table
 from lerobot_wm.markdown import escaped
 from lerobot_wm.policies.common.card import IMAGINATION, TrainingData, model_card
@@ -60,22 +60,11 @@ def _column(result: OpenLoop) -> np.ndarray:
 
 
 @dataclass
-class CheckpointFolder:
-    """`--policy.path`, a folder.
-
-    Args:
-        path: `.../checkpoints/last/pretrained_model`.
-    """
-
-    path: Path
-
-
-@dataclass
 class PublishConfig:
     """Flags of `lerobot-wm publish`.
 
     Args:
-        policy: The checkpoint.
+        policy: The checkpoint's folder, `.../checkpoints/last/pretrained_model`.
         repo_id: The repository, as user/name; files that are there already and have not changed are not sent again.
         records: Records of `lerobot-wm eval` of this checkpoint, for the card's table; None for no table.
         dataset: An image dataset; the card shows an episode of each task and how the world model imagines it. None for
@@ -83,7 +72,7 @@ class PublishConfig:
         private: Make a new repository private.
     """
 
-    policy: CheckpointFolder
+    policy: CheckpointConfig
     repo_id: str
     records: str | None = None
     dataset: SourceConfig | None = None
@@ -101,7 +90,7 @@ def publish(cfg: PublishConfig) -> str:
         ValueError: The records are of another policy, the checkpoint holds no world model, or the dataset lacks what it
             reads.
     """
-    folder = cfg.policy.path
+    folder = Path(cfg.policy.path)
     if not (folder / TRAIN_CONFIG_NAME).is_file():
         raise FileNotFoundError(
             f"{folder} holds no {TRAIN_CONFIG_NAME}, so it is not a checkpoint of a training run. Give "

@@ -1,6 +1,7 @@
 """World models that imagine images, and the episodes of image datasets that they are shown."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,6 +22,13 @@ from lerobot_wm.world_model.rssm import RSSMState
 _FRAMES_AT_ONCE = 64
 
 type ImaginingPolicy = WMRSSMPolicy | LatentPolicy
+
+
+@dataclass
+class CheckpointConfig:
+    """`--policy.path`, as in `lerobot-eval`."""
+
+    path: str
 
 
 def load_world_model(path: str) -> ImaginingPolicy:
