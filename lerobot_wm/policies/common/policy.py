@@ -83,12 +83,12 @@ class StrictPolicy(PreTrainedPolicy):
             kwargs["dataset_meta"] = dataset_meta
         return super().from_pretrained(pretrained_name_or_path, config=config, strict=strict, **kwargs)
 
-    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+    def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
         """LeRobot's, without the revision of the checkpoint it was trained on from.
 
         LeRobot would look for that revision in this one's repository when it loads it by name.
         """
-        super()._save_pretrained(save_directory, state_dict)
+        super()._save_pretrained(save_directory, *args, **kwargs)
         config = copy(self.config)
         config.pretrained_revision = None
         config._save_pretrained(save_directory)
