@@ -11,7 +11,6 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from safetensors import SafetensorError
-from torch import Tensor
 
 from lerobot_wm.hub.model_card import TrainingData, model_card
 from lerobot_wm.policies.common.checkpoint import WHOLE, not_finite, read_config
