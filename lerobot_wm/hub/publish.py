@@ -16,9 +16,8 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.factory import get_policy_class
 from PIL import Image
 
-from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.data.source import dataset_folder
-from lerobot_wm.hub.errors import check_can_push
+from lerobot_wm.data.source import SourceConfig, dataset_folder
+from lerobot_wm.errors import check_can_push
 from lerobot_wm.hub.model_card import IMAGINATION, TrainingData, model_card
 from lerobot_wm.inspect.episodes import check_features, load_world_model
 from lerobot_wm.inspect.open_loop import CONTEXT, OpenLoop, open_loop, psnr_table

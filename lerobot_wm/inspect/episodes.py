@@ -9,7 +9,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.nn.images import resize_images
 from lerobot_wm.policies.common.cameras import camera_images
 from lerobot_wm.policies.latent.encoder import load_encoder

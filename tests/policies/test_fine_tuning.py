@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from torch import nn
 from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTensorMode
 
-from lerobot_wm.encode.command import encode_to_cache
+from lerobot_wm.encode.dataset import encode_to_cache
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.multi_task_policy import MultiTaskPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
