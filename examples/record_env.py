@@ -23,7 +23,7 @@ from lerobot.envs import make_env, make_env_pre_post_processors, preprocess_obse
 from lerobot.envs.configs import EnvConfig
 from tqdm import trange
 
-from lerobot_wm.quiet import quiet
+from lerobot_wm.system import quiet
 
 
 @dataclass

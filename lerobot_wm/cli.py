@@ -1,4 +1,4 @@
-"""The `lerobot-wm` command: a table of subcommands, each with its own module and `main()`."""
+"""The `lerobot-wm` command: a table of subcommands, each a module with a `main()`."""
 
 import importlib
 import sys
@@ -13,20 +13,23 @@ from lerobot.configs.parser import (
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_wm.errors import exit_with_one_line
-from lerobot_wm.quiet import drop_remarks
+from lerobot_wm.system import hide_harmless_messages
 
-# name -> (module with a main() that reads sys.argv, what it does)
+# Name -> (module whose main() reads sys.argv, what it does).
 COMMANDS: dict[str, tuple[str, str]] = {
     "collect": ("lerobot_wm.collect.command", "scripted-expert Meta-World demonstrations -> LeRobotDataset"),
-    "expert": ("lerobot_wm.commands.expert", "the scripted expert's rollouts, one record each"),
-    "relabel": ("lerobot_wm.commands.relabel", "copy of a dataset that is rewarded by another column"),
+    "expert": ("lerobot_wm.commands.expert", "rollouts of the scripted expert -> records"),
+    "relabel": ("lerobot_wm.commands.relabel", "copy of a dataset with another column as its reward"),
     "init": ("lerobot_wm.commands.init", "checkpoint of an untrained world model or a frozen image backbone"),
     "train": ("lerobot_wm.train.command", "lerobot-train with its flags, fed from RAM or GPU memory"),
     "encode": ("lerobot_wm.encode.command", "image dataset + frozen world model -> latent LeRobotDataset"),
     "eval": ("lerobot_wm.evaluate.command", "lerobot-eval with its flags, one record per rollout"),
     "report": ("lerobot_wm.report.command", "records -> success table and self-contained HTML page"),
-    "quality": ("lerobot_wm.inspect.quality", "how good a world model is on positions it was not trained on"),
-    "dream": ("lerobot_wm.inspect.dream_command", "an episode as a world model imagines it: video and strip"),
+    "quality": ("lerobot_wm.inspect.quality", "how good a world model is on unseen positions"),
+    "dream": (
+        "lerobot_wm.inspect.dream_command",
+        "an episode as a world model imagines it -> video and strip",
+    ),
     "publish": ("lerobot_wm.hub.publish", "checkpoint -> the Hub, with results and a dream on its card"),
     "doctor": ("lerobot_wm.commands.doctor", "check Python, GL, packages, GPU, disk and Hub login"),
 }
@@ -40,16 +43,16 @@ def usage() -> str:
 
 
 def load_plugins(arguments: list[str]) -> list[str]:
-    """Have every command know the types of other packages: installed ones, and those named by a flag.
+    """Register the types of installed plug-ins, and of packages named by a flag.
 
     Args:
-        arguments: Of the command; `--discover_packages_path=PACKAGE`, under any prefix, names a package to import.
+        arguments: Arguments of the command; `--discover_packages_path=PACKAGE`, with any prefix, names a package.
 
     Returns:
         The other arguments.
 
     Raises:
-        PluginLoadError: There is no such package, or it cannot be imported.
+        PluginLoadError: A package is missing or cannot be imported.
     """
     register_third_party_plugins()
     for flag, package in parse_plugin_args(PLUGIN_DISCOVERY_SUFFIX, arguments).items():
@@ -59,20 +62,20 @@ def load_plugins(arguments: list[str]) -> list[str]:
 
 
 def main() -> None:
-    """Run the subcommand named first on the command line."""
+    """Run the subcommand that the command line names first."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("-h", "--help"):
         print(usage())
         return
     if name not in COMMANDS:
-        sys.exit(f"lerobot-wm: no command '{name}'; expected one of {', '.join(COMMANDS)}.")
-    drop_remarks()
+        sys.exit(f"lerobot-wm: unknown command '{name}'; expected one of {', '.join(COMMANDS)}.")
+    hide_harmless_messages()
     with exit_with_one_line(f"lerobot-wm {name}"):
         try:
             arguments = load_plugins(sys.argv[2:])
         except PluginLoadError as error:
             sys.exit(f"lerobot-wm {name}: {error}")
-        # LeRobot's parsers read sys.argv themselves: hand the subcommand its own argument list.
+        # LeRobot's parsers read sys.argv.
         sys.argv = [f"lerobot-wm {name}", *arguments]
         importlib.import_module(COMMANDS[name][0]).main()
 

@@ -1,23 +1,35 @@
-"""How a command ends early: with one line that says what its user can do."""
+"""Errors a user can act on become one line instead of a traceback."""
 
 import errno
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from traceback import clear_frames, walk_tb
 
-from lerobot_wm.hub.errors import explain
+import httpx
+from huggingface_hub import whoami
+from huggingface_hub.errors import (
+    EntryNotFoundError,
+    HfHubHTTPError,
+    HFValidationError,
+    LocalTokenNotFoundError,
+    OfflineModeIsEnabled,
+    RepositoryNotFoundError,
+    RevisionNotFoundError,
+)
 
-INTERRUPTED = 130  # exit code of a command that Ctrl-C ended: 128 and the number of the signal
+INTERRUPTED = 130  # exit code after Ctrl-C: 128 plus the signal's number
+LOGIN = "log in with `hf auth login`, or set HF_TOKEN"
 _OURS = "lerobot_wm"
-# What a disk says, in any library's message, -> how to mend it.
+# Errors of the disk, which libraries often repeat in their own exceptions -> how to fix them.
 _DISK = {
     errno.ENOSPC: "make room there, or choose another place",
     errno.EDQUOT: "make room there, or choose another place",
     errno.EROFS: "make it writable, or choose another place",
 }
-# What the system says of a file it names.
+# Errors that the operating system reports together with a file name.
 _FILE = {
     **_DISK,
     errno.EACCES: "make it accessible, or choose another place",
@@ -28,93 +40,97 @@ _FILE = {
 _PARSERS = ("draccus", "lerobot.configs.policies", "lerobot.configs.train")
 
 
+class HubRefusalError(RuntimeError):
+    """The Hub would refuse this command; found before any work is done."""
+
+
+class WorkerError(RuntimeError):
+    """The one-line error of a worker process."""
+
+
 @contextmanager
 def exit_with_one_line(command: str) -> Iterator[None]:
-    """End the program with one line on errors that say how to mend them; other errors pass, with their traceback.
+    """End the program with one line for errors that tell the user what to do; others keep their traceback.
 
-    These are Ctrl-C, a disk that takes no more, what the Hub refuses, flags and configurations that cannot be read, and
-    what is raised in this package, not in a library below it: ValueError, OSError, RuntimeError and what is derived
-    from them.
+    These are: Ctrl-C, full or read-only disks, refusals of the Hub, unreadable flags and configurations, and each
+    ValueError, OSError and RuntimeError that is raised in this package rather than in a library.
 
     Args:
-        command: Its name, for the line.
+        command: The command's name, with which the line starts.
     """
     try:
         yield
     except KeyboardInterrupt as stop:
-        _close_bars(stop)
-        how = str(stop) or "the same command goes on where it was, or begins again"
-        print(f"\n{command}: interrupted; {how}.", file=sys.stderr)
+        _close_progress_bars(stop)
+        hint = str(stop) or "run the same command again; it resumes or starts over"
+        print(f"\n{command}: interrupted; {hint}.", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     except Exception as error:
-        line = _line(error)
+        line = _one_line_for(error)
         if line is None:
             raise
-        _close_bars(error)
+        _close_progress_bars(error)
         raise SystemExit(f"{command}: {line}") from error
 
 
-def _close_bars(error: BaseException | None) -> None:
-    """Have progress bars, which live in the frames that an error came through, write their last before our line."""
+def _close_progress_bars(error: BaseException | None) -> None:
+    """Drop the frames that an error passed through, so that progress bars in them finish printing before our line."""
     while error is not None:
         clear_frames(error.__traceback__)
         error = error.__context__
 
 
-class WorkerError(RuntimeError):
-    """What a worker process ended with; its text is one line, which its traceback cannot tell in another process."""
-
-
 @contextmanager
-def explained_to_parent() -> Iterator[None]:
-    """In a worker: pass what ends with one line on as that line.
+def errors_as_lines() -> Iterator[None]:
+    """In a worker process: turn errors that deserve one line into a `WorkerError` with that line.
+
+    A traceback does not reach the parent process, which could not tell where the error was raised.
 
     Raises:
-        WorkerError: In place of such an error; others pass.
+        WorkerError: Instead of such an error; others pass.
     """
     try:
         yield
     except Exception as error:
-        line = _line(error)
+        line = _one_line_for(error)
         if line is None:
             raise
         raise WorkerError(line) from error
 
 
 def disk_problem(error: BaseException) -> str | None:
-    """What a disk refused, and how to mend it; None where the error is another, or has words of this package.
+    """What the disk refused and how to fix it; None for other errors and for those raised in this package.
 
-    Libraries that write files pass the system's words on, its number not always.
+    Libraries repeat the system's message, but not always its error number.
     """
     if isinstance(error, OSError) and error.filename and error.errno in _FILE:
         return f"{error.filename}: {os.strerror(error.errno)}: {_FILE[error.errno]}"
     if _is_ours(error):
         return None
-    for number, mend in _DISK.items():
+    for number, fix in _DISK.items():
         if os.strerror(number) in str(error):
-            return f"{os.strerror(number)}: {mend}"
+            return f"{os.strerror(number)}: {fix}"
     cause = error.__cause__ or error.__context__
     return None if cause is None else disk_problem(cause)
 
 
-def _line(error: Exception) -> str | None:
-    refusal = explain(error)
-    if refusal is not None:
-        return refusal
-    problem = disk_problem(error)
-    if problem is not None:
-        return f"{problem}; then the same command goes on where it was, or begins again."
+def _one_line_for(error: Exception) -> str | None:
+    # In a chain of errors the first about the Hub says most: those before wrap it, those after are httpx's.
+    for cause in _causes(error):
+        if (refusal := _hub_problem(cause)) is not None:
+            return refusal
+    if (problem := disk_problem(error)) is not None:
+        return f"{problem}; then run the same command again; it resumes or starts over."
     if _is_ours(error):
-        return " ".join(str(error).split())
+        return one_line(error)
     if any(module.startswith(_PARSERS) for module in _modules(error)):
-        cause = f" ({error.__cause__})" if error.__cause__ else ""
-        text = " ".join(f"{error}{cause}".split())
-        return f"flags or a configuration file cannot be read. {type(error).__name__}: {text}"
+        reason = f" ({error.__cause__})" if error.__cause__ else ""
+        return f"cannot read the flags or a configuration file. {type(error).__name__}: {one_line(f'{error}{reason}')}"
     return None
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether this package raised it, and it says how to mend it."""
+    """Whether this package raised the error for the user to read."""
     if isinstance(error, WorkerError):
         return True
     modules = _modules(error)
@@ -126,5 +142,101 @@ def _is_ours(error: BaseException) -> bool:
 
 
 def _modules(error: BaseException) -> list[str]:
-    """The modules that an error came through, that which raised it last."""
+    """The modules that an error passed through; the one that raised it is last."""
     return [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and its causes, the original one last."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+
+
+def one_line(text: object) -> str:
+    """A message without line breaks and repeated spaces."""
+    return " ".join(str(text).split())
+
+
+def check_can_push(repo_id: str) -> None:
+    """Check that the user may push to a repository, before work is done whose result would be refused.
+
+    Raises:
+        HubRefusalError: There is no token, or the token cannot write to the repository's namespace.
+        HfHubHTTPError, ConnectionError: The Hub refuses the token, or cannot be reached.
+    """
+    try:
+        user = whoami()
+    except LocalTokenNotFoundError as error:
+        raise HubRefusalError(
+            f"pushing to {repo_id} needs a token with write access, and there is no token: {LOGIN}."
+        ) from error
+    if user["auth"].get("accessToken", {}).get("role") == "read":
+        raise HubRefusalError(
+            f"pushing to {repo_id} needs a token with write access, but the token of {user['name']} is read-only: "
+            f"{LOGIN}, with another token."
+        )
+    namespaces = [user["name"], *(organization["name"] for organization in user["orgs"])]
+    owner = repo_id.split("/")[0] if "/" in repo_id else user["name"]
+    if owner not in namespaces:
+        raise HubRefusalError(
+            f"{repo_id} belongs to {owner}, but the token is of {user['name']}, who can write to "
+            f"{', '.join(namespaces)}: push to {user['name']}/{repo_id.split('/')[1]}, or {LOGIN} as {owner}."
+        )
+
+
+def _hub_problem(error: BaseException) -> str | None:
+    """What happened on the Hub and how to fix it; None for other errors."""
+    match error:
+        case HubRefusalError():
+            return str(error)
+        case OfflineModeIsEnabled():
+            return "the Hub is needed, but HF_HUB_OFFLINE is set: unset it, or use files on this machine."
+        case LocalTokenNotFoundError():
+            return f"the Hub asks for a token and there is none: {LOGIN}."
+        case HFValidationError():
+            return f"neither a folder on this machine nor a repository name, user/name. {one_line(error)}"
+        case HfHubHTTPError():
+            return _hub_answer(error)
+        case httpx.TransportError():
+            return (
+                f"lost the connection to {error.request.url.host} ({type(error).__name__}). An unfinished push changes "
+                "nothing on the Hub: run the command again; files that arrived are not sent twice."
+            )
+    return None
+
+
+def _hub_answer(error: HfHubHTTPError) -> str:
+    url, status = error.response.url, error.response.status_code
+    kind, repo_id, revision = _repository_in(url.path)
+    match error:
+        case RevisionNotFoundError():
+            prefix = "datasets/" if kind == "dataset" else ""
+            page = f"{url.scheme}://{url.netloc.decode()}/{prefix}{repo_id}/commits/main"
+            return (
+                f"{kind} {repo_id} has no revision {revision!r}; expected one of its branches, tags or commits, "
+                f"see {page}."
+            )
+        case EntryNotFoundError():
+            return f"{kind} {repo_id} has no such file ({url}): check the name, and whether its upload has finished."
+        case RepositoryNotFoundError():
+            return (
+                f"there is no {kind} {repo_id} on the Hub, or it is private and this token cannot read it ({status}): "
+                f"check the name; for a private repository, {LOGIN}."
+            )
+    answer = one_line(error.server_message or error)
+    if status in (401, 403):
+        return f"the Hub refuses ({status}, {answer}): {LOGIN}, with write access."
+    return f"the Hub answered {status} to {error.request.method} {url}: {answer}"
+
+
+def _repository_in(path: str) -> tuple[str, str, str | None]:
+    """Kind of repository, its name and the revision in a path of the Hub."""
+    match = re.match(
+        r"/(?:api/)?(?P<kind>datasets/|models/)?(?P<repo_id>[^/]+/[^/]+)(?:/[a-z-]+/(?P<revision>[^/]+))?",
+        path,
+    )
+    if match is None:
+        return "repository", path, None
+    kind = "dataset" if match["kind"] == "datasets/" else "model"
+    return kind, match["repo_id"], match["revision"]

@@ -1,46 +1,76 @@
-"""Files that are whole or not there."""
+"""Outputs that are complete or absent, and that one process at a time writes."""
 
 import errno
 import fcntl
 import logging
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file, its folder too, or replace it at once: a process that is killed leaves the one before."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.part")
-    unfinished.write_text(text)
-    unfinished.replace(path)
-
-
 logger = logging.getLogger(__name__)
 
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)  # some network file systems have none
+UNFINISHED = ".part"  # suffix of an output that is still being written
+# Some network file systems have no locks.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
+
+
+@contextmanager
+def appears_whole(path: Path) -> Iterator[Path]:
+    """Write a file or folder under a temporary name beside it, and rename it when the block ends without an error.
+
+    What a killed process left under the temporary name is removed first, what this one leaves on an error afterwards.
+
+    Yields:
+        The temporary path, where nothing exists yet; its parent folder does.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}{UNFINISHED}")
+    _remove(temporary)
+    try:
+        yield temporary
+        temporary.replace(path)
+    except BaseException:
+        # Whatever cannot be removed, the error matters more.
+        with suppress(OSError):
+            _remove(temporary)
+        raise
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file, or replace it at once; its folder is created."""
+    with appears_whole(path) as temporary:
+        temporary.write_text(text)
 
 
 @contextmanager
 def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> Iterator[None]:
-    """Hold an output, whose folder is made, while it is written; the lock ends with the process, however that ends.
+    """Hold a lock on an output while it is written; the lock ends with the process, however that ends.
 
-    The lock is a hidden file beside the output, which the last to hold it removes.
+    The lock is a hidden file beside the output. Its last holder removes it.
 
     Args:
-        output: A file or folder, there or not.
-        job: Which of several jobs that share the work; different ones get along.
-        wait: Wait for another writer to end, instead of refusing.
+        output: A file or folder, which need not exist; its parent folder is created.
+        job: One of several jobs that share the work: different jobs may write at the same time.
+        wait: Wait for another writer instead of raising an error.
 
     Raises:
-        BlockingIOError: Another process writes it.
-        OSError: The folder cannot be written.
+        BlockingIOError: Another process is writing the output.
+        OSError: The folder is not writable.
     """
-    output = Path(os.path.abspath(output))  # of `.` the name, and what is beside it
+    # An absolute path, because `.` has neither a name nor a place beside it.
+    output = Path(os.path.abspath(output))
     output.parent.mkdir(parents=True, exist_ok=True)
-    # Jobs share the lock of the whole, for which filelock has no kind; each holds its own alone.
+    # Jobs share the lock of the whole output, and each holds one of its own.
     locks = {f".{output.name}.lock": fcntl.LOCK_EX if job is None else fcntl.LOCK_SH}
     if job is not None:
         locks[f".{output.name}.{job}.lock"] = fcntl.LOCK_EX
@@ -50,7 +80,7 @@ def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> 
                 stack.enter_context(_locked(output.with_name(name), kind if wait else kind | fcntl.LOCK_NB))
             except BlockingIOError as error:
                 raise BlockingIOError(
-                    f"another process is writing {output}: wait until it has ended, end it, or choose another output."
+                    f"another process is writing {output}: wait for it, stop it, or choose another output."
                 ) from error
         yield
 
@@ -61,13 +91,14 @@ def _locked(path: Path, operation: int) -> Iterator[None]:
     try:
         yield
     finally:
-        with file, suppress(OSError):  # others hold it still
+        # Only the last holder gets the exclusive lock, and removes the file.
+        with file, suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
 
 
 def _lock(path: Path, operation: int) -> IO:
-    """The lock's file, open and locked."""
+    """Open and lock a lock file."""
     while True:
         file = path.open("a")
         try:
@@ -76,9 +107,12 @@ def _lock(path: Path, operation: int) -> IO:
             if error.errno not in _NO_LOCKS:
                 file.close()
                 raise
-            logger.warning("%s: this file system has no locks; see that nothing else writes there.", path)
+            logger.warning(
+                "%s: no locks on this file system; make sure that no other process writes there.", path
+            )
             return file
-        with suppress(FileNotFoundError):  # its last holder may have removed it just before
+        # The last holder may have removed the file between our opening and locking it.
+        with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
         file.close()

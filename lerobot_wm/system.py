@@ -1,41 +1,45 @@
-"""The CPU: how many cores there are to use, and of what kind."""
+"""The machine: usable cores, the kind of CPU, memory, and the log messages of other libraries."""
 
 import ctypes
-import json
+import logging
 import math
 import os
 import platform
-import re
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-_BFLOAT16_FLAGS = ("amx_bf16", "avx512_bf16", "bf16")  # of /proc/cpuinfo; the last one is Arm's
-
-
+# CPU flags of /proc/cpuinfo; the last one is Arm's.
+_BFLOAT16_FLAGS = ("amx_bf16", "avx512_bf16", "bf16")
 _CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+# From glibc's malloc.h.
+_TRIM_THRESHOLD = -1
+_MMAP_THRESHOLD = -3
+_KEPT_BYTES = 2**30
+# glibc before 2.35 refuses a higher mmap threshold.
+_LARGEST_BEFORE_2_35 = 2**25
+_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
 
 
 def usable_cores() -> int:
-    """Cores this process may run on: fewer than the machine has under `taskset`, in a container or in a batch job."""
-    pinned = hasattr(os, "sched_getaffinity")  # not on macOS and Windows
+    """Cores that this process may use; fewer than the machine has under `taskset`, in a container or in a batch job."""
+    # Not on macOS and Windows.
+    pinned = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if pinned else os.cpu_count() or 1
-    return max(1, math.ceil(min(cores, _cores_worth_of_time())))
+    return max(1, math.ceil(min(cores, _cgroup_cores())))
 
 
-def _cores_worth_of_time() -> float:
-    """How many cores' time a container or batch job may use at once (cgroup v2); infinite without a limit."""
+def _cgroup_cores() -> float:
+    """Cores' worth of time that a container or batch job may use (cgroup v2); infinite without a limit."""
     if not _OWN_CGROUP.exists():  # not Linux
         return math.inf
     own = [line[3:] for line in _OWN_CGROUP.read_text().splitlines() if line.startswith("0::")]
     limits = [math.inf]
     for folder in (_CGROUPS / path.lstrip("/") for path in own):
-        for limited in (folder, *folder.parents):  # a container sees its own group as the topmost one
+        # A container sees its own group as the topmost one.
+        for limited in (folder, *folder.parents):
             file = limited / "cpu.max"
             quota, period = file.read_text().split() if file.is_file() else ("max", "100000")
             if quota != "max":
@@ -44,7 +48,7 @@ def _cores_worth_of_time() -> float:
 
 
 def cpu_kind() -> str:
-    """The processor's name and what multiplies bfloat16 in it, on which speeds and the usual precision depend."""
+    """The processor's name and its bfloat16 instructions, on which speed and the default precision depend."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     facts = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
@@ -54,20 +58,12 @@ def cpu_kind() -> str:
     return f"{name}, native bfloat16: {bfloat16}"
 
 
-# Of glibc's malloc.h.
-_TRIM_THRESHOLD = -1
-_MMAP_THRESHOLD = -3
-_KEPT_BYTES = 2**30
-_LARGEST_BEFORE_2_35 = 2**25  # glibc before 2.35 refuses a higher threshold of blocks of their own
-_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
-
-
 def keep_freed_memory() -> None:
-    """Have glibc keep freed blocks for the next step, in place of giving them back to the system.
+    """Let glibc keep freed memory for the next training step instead of returning it to the system.
 
-    A training step on a CPU allocates and frees the same activations each time. Returned to the system, every page
-    of them is fetched and zeroed anew in the next step. Blocks of up to 1 GiB are kept, before glibc 2.35 of up to
-    32 MiB. Does nothing with other C libraries, nor where the user has set one of glibc's own variables.
+    A training step on a CPU allocates and frees the same activations each time; memory that was returned must be
+    fetched and zeroed again, page by page. Blocks of up to 1 GiB are kept (32 MiB before glibc 2.35). Does nothing
+    with other C libraries, or where the user has set one of glibc's own variables.
     """
     if not sys.platform.startswith("linux") or any(name in os.environ for name in _VARIABLES):
         return
@@ -80,96 +76,45 @@ def keep_freed_memory() -> None:
 
 
 @contextmanager
-def held_back(*numbers: signal.Signals) -> Iterator[None]:
-    """Have signals wait: a process that is being started is known, and can be ended, only afterwards.
+def quiet() -> Iterator[None]:
+    """Hide what LeRobot, `datasets` and the video codec print per episode; errors are shown.
 
-    Blocking them would not do: a signal that reaches another thread is handled in the main one all the same.
-
-    Args:
-        *numbers: Whose handlers wait; the first that arrived is raised afterwards.
+    The codec stays quiet afterwards: its previous level cannot be read.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # handlers run in the main thread only
-        return
-    arrived: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, frame: arrived.append(number)) for number in numbers
-    }
+    import datasets
+
+    logger = logging.getLogger("lerobot")
+    level = logger.level
+    bars = datasets.utils.logging.is_progress_bar_enabled()
     try:
-        yield
+        with warnings.catch_warnings():
+            silence()
+            yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if arrived:
-            signal.raise_signal(arrived[0])
+        logger.setLevel(level)
+        if bars:
+            datasets.enable_progress_bars()
 
 
-@dataclass(frozen=True)
-class Share:
-    """The index-th of `count` shares; counted from 1."""
+def silence() -> None:
+    """Do what `quiet` does, for the rest of this process."""
+    import av.logging
+    import datasets
 
-    index: int
-    count: int
-
-    @classmethod
-    def parse(cls, text: str) -> "Share":
-        """Read i/n.
-
-        Raises:
-            ValueError: it is not of this form, or i is not one of 1 to n.
-        """
-        match = re.fullmatch(r"(\d+)/(\d+)", text)
-        if match is None:
-            raise ValueError(f"shard is {text!r}; expected i/n, such as 1/4 for the first of four jobs.")
-        index, count = int(match[1]), int(match[2])
-        if not 1 <= index <= count:
-            raise ValueError(
-                f"shard is {text}; expected i from 1 to n, such as 1/4 for the first of four jobs."
-            )
-        return cls(index, count)
-
-    def of[T](self, parts: Sequence[T]) -> list[T]:
-        """This job's parts, as many of each stretch as the other jobs have.
-
-        Raises:
-            ValueError: there are fewer parts than jobs.
-        """
-        if len(parts) < self.count:
-            raise ValueError(
-                f"shard is {self.index}/{self.count}, but this work has only {len(parts)} parts: "
-                f"start at most {len(parts)} jobs."
-            )
-        return list(parts[self.index - 1 :: self.count])
+    logging.getLogger("lerobot").setLevel(logging.ERROR)
+    av.logging.set_libav_level(av.logging.ERROR)
+    datasets.disable_progress_bars()
+    # Scripted experts command more than +-1 by design; actions are clipped before they are recorded.
+    warnings.filterwarnings("ignore", message="Constant.s. may be too high")
 
 
-def shards_folder(root: Path) -> Path:
-    """Where the shards of the collection of the dataset `root` lie until they are merged."""
-    return root.with_name(f"{root.name}.shards")
-
-
-def parts_folder(root: Path) -> Path:
-    """Where the latents of the dataset `root` lie until all are encoded."""
-    return root.with_name(f"{root.name}.parts")
-
-
-def refuse_difference(found: Mapping[str, Any], expected: Mapping[str, Any], what: str, mend: str) -> None:
-    """Refuse work that was done with other settings.
-
-    Args:
-        found: its settings, read from JSON.
-        expected: those of this run.
-        what: what was found, such as "x.shards/reach-v3-00000 is a shard".
-        mend: what to do about it.
-
-    Raises:
-        FileExistsError: naming each setting that differs.
-    """
-    # Through JSON, so that both sides have its types.
-    expected = json.loads(json.dumps(expected))
-    different = [
-        f"{name} {found.get(name)} there, {value} here"
-        for name, value in expected.items()
-        if found.get(name) != value
-    ]
-    if different:
-        raise FileExistsError(f"{what} made with other settings ({'; '.join(different)}); {mend}.")
+def hide_harmless_messages() -> None:
+    """Hide messages of LeRobot and PyOpenGL that are not about a problem, for the rest of this process."""
+    # LeRobot warns once per video that torchcodec is missing; PyAV decodes videos as well.
+    logging.getLogger("lerobot.utils.import_utils").addFilter(
+        lambda record: "'torchcodec' is not available" not in record.getMessage()
+    )
+    # A name that LeRobot chose for the job.
+    logging.getLogger("lerobot.configs.eval").setLevel(logging.ERROR)
+    # The accelerator module of PyOpenGL is not installed.
+    logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)

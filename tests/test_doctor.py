@@ -21,7 +21,7 @@ def test_command_reports_every_part_and_fits_the_terminal(tmp_path: Path) -> Non
     assert max(map(len, run.stdout.splitlines())) <= 100
     for part in ("Python", "mujoco", "rendering", "LeRobot plug-in", "CPU", "GPU", "Hub login", "disk"):
         assert part in run.stdout
-    assert "mend:" not in run.stdout
+    assert "fix:" not in run.stdout
     assert "none; to push: hf auth login" in run.stdout
 
 
@@ -39,24 +39,24 @@ def test_mujoco_that_breaks_metaworld_is_reported(version: str) -> None:
     [broken] = [check for check in doctor.check_packages(installed) if check.is_broken]
     assert broken.name == "mujoco"
     assert version in broken.found
-    assert "<3.17" in broken.mend
+    assert "<3.17" in broken.fix
 
 
 def test_leftovers_of_mujoco_4_are_reported() -> None:
     installed = {**doctor.installed_versions(), "mujoco-core": "4.0.0"}
     [broken] = [check for check in doctor.check_packages(installed) if check.is_broken]
     assert broken.found == "mujoco-core"
-    assert "pip uninstall -y mujoco-core" in broken.mend
+    assert "pip uninstall -y mujoco-core" in broken.fix
 
 
 def test_missing_package_is_reported() -> None:
     check = doctor.check_requirement(Requirement("metaworld==3.0.0"), {})
-    assert check.verdict == "mend: pip install 'metaworld==3.0.0'"
+    assert check.verdict == "fix: pip install 'metaworld==3.0.0'"
 
 
 def test_advice_keeps_the_extras_and_is_shown_whole() -> None:
     check = doctor.check_requirement(Requirement("lerobot[training,dataset]>=0.6.1,<0.7"), {})
-    assert check.mend == "pip install 'lerobot[dataset,training]<0.7,>=0.6.1'"
+    assert check.fix == "pip install 'lerobot[dataset,training]<0.7,>=0.6.1'"
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(doctor.render([check]))
     assert "lerobot[dataset,training]" in console.export_text()
@@ -76,7 +76,7 @@ def test_full_disk_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
 
 def test_optional_parts_never_fail_the_command() -> None:
     check = doctor.Check("GPU", "driver too old", "update it", needed=False)
-    assert check.verdict == "mend: update it"
+    assert check.verdict == "fix: update it"
     assert not check.is_broken
 
 

@@ -26,7 +26,8 @@ from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.evaluate import rollouts
 from lerobot_wm.evaluate.command import evaluate
 from lerobot_wm.evaluate.config import BatchedEvalConfig, EvaluateConfig, variation_of
-from lerobot_wm.evaluate.rollouts import TaskRunner, training_seed
+from lerobot_wm.evaluate.rollouts import TaskRunner
+from lerobot_wm.evaluate.wandb_log import training_config
 from lerobot_wm.policies.common import checkpoint
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.records import Record, read_records
@@ -320,7 +321,7 @@ def test_processors_and_seed_are_of_the_policys_revision(
         return make(*args, **kwargs)
 
     monkeypatch.setattr(rollouts, "make_pre_post_processors", noting)
-    monkeypatch.setattr(rollouts, "training_seed", lambda path, revision: asked.append(revision))
+    monkeypatch.setattr(rollouts, "training_config", lambda path, revision: asked.append(revision) or {})
     cfg = config_for(policy_path, tmp_path, WalkEnvConfig(), 1, 1)
     cfg.policy.pretrained_revision = "v1"
     TaskRunner(cfg)
@@ -334,9 +335,8 @@ def test_a_hub_that_cannot_be_reached_is_no_broken_checkpoint(monkeypatch: pytes
     monkeypatch.setattr(checkpoint, "hf_hub_download", offline)
     with pytest.raises(LocalEntryNotFoundError):
         checkpoint.read_config("user/policy")
-    assert training_seed(Path("user/policy")) is None, "where the rest of it is here"
+    assert training_config(Path("user/policy")) == {}, "the rest of it is here"
 
 
-def test_a_checkpoint_without_training_configuration_has_no_seed(tmp_path: Path) -> None:
-    assert training_seed(tmp_path) is None
-    assert training_seed(None) is None
+def test_a_checkpoint_without_training_configuration(tmp_path: Path) -> None:
+    assert training_config(tmp_path) == training_config(None) == {}

@@ -25,7 +25,7 @@ from lerobot_wm.experiment.stage import Stage, in_order, unfinished
 from lerobot_wm.inspect.quality import QualityConfig
 from lerobot_wm.report.arms import ARMS
 from lerobot_wm.report.command import ReportConfig
-from lerobot_wm.system import parts_folder, shards_folder
+from lerobot_wm.workers import parts_folder, shards_folder
 
 CONFIGS: dict[str, Any] = {
     "collect": CollectConfig,

@@ -7,11 +7,11 @@ import time
 
 import pytest
 
-from lerobot_wm.workers import interrupts_held
+from lerobot_wm.workers import delay_interrupts
 
 
 def interrupted(finished: list[bool]) -> None:
-    with interrupts_held():
+    with delay_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0.2)
         finished.append(True)
@@ -41,7 +41,7 @@ def test_workers_can_be_started_from_any_thread() -> None:
 
     def start() -> None:
         try:
-            with interrupts_held():
+            with delay_interrupts():
                 pass
         except ValueError as error:
             errors.append(error)

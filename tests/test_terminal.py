@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from lerobot.utils.import_utils import get_safe_default_video_backend
 
-from lerobot_wm.quiet import drop_remarks
+from lerobot_wm.system import hide_harmless_messages
 from tests.flags import DATASET_FLAGS
 
 COLUMNS = 100
@@ -113,7 +113,7 @@ def test_a_pipe_gets_neither_colours_nor_chatter(
 
 def test_what_is_wrong_with_a_decoder_is_not_dropped(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, "lerobot.utils.import_utils")
-    drop_remarks()
+    hide_harmless_messages()
     get_safe_default_video_backend()  # torchcodec is not in the lock: nothing is wrong
     logging.getLogger("lerobot.utils.import_utils").warning("'torchcodec' is installed but cannot be loaded")
     assert caplog.messages == ["'torchcodec' is installed but cannot be loaded"]

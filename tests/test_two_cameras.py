@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader
 
 from lerobot_wm.data.loader import RamLoader
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.inspect.open_loop import CONTEXT, open_loop, strips_figure
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy

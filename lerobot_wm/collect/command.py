@@ -1,4 +1,4 @@
-"""Writing shards, in this process or in several."""
+"""`lerobot-wm collect`: demonstrations of Meta-World's scripted experts, collected in shards and merged."""
 
 import json
 import logging
@@ -11,7 +11,6 @@ from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from dataclasses import asdict
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import Any
 
 import draccus
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -20,22 +19,109 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from lerobot_wm.collect.card import push_demonstrations
 from lerobot_wm.collect.config import CollectConfig, plan_shards
 from lerobot_wm.collect.merge import merge_datasets
-from lerobot_wm.collect.shards import TEMPORARY_PREFIX, Shard, ShardRecord, versions, write_shard
+from lerobot_wm.collect.shards import Shard, ShardRecord, versions, write_shard
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.envs.tasks import expert_name
-from lerobot_wm.errors import explained_to_parent
-from lerobot_wm.files import sole_writer
-from lerobot_wm.hub.dataset_card import push_demonstrations
-from lerobot_wm.hub.errors import check_can_push
-from lerobot_wm.quiet import quiet, silence
-from lerobot_wm.system import Share, refuse_difference, shards_folder
-from lerobot_wm.workers import end_with_parent, interrupts_held, workers_interrupted
+from lerobot_wm.errors import check_can_push, errors_as_lines
+from lerobot_wm.files import UNFINISHED, appears_whole, sole_writer
+from lerobot_wm.system import quiet, silence
+from lerobot_wm.workers import (
+    Job,
+    check_same_settings,
+    delay_interrupts,
+    end_with_parent,
+    shards_folder,
+    workers_interrupted,
+)
+
+
+def collect(config: CollectConfig) -> Path:
+    """Collect a dataset or one job's part of it, or resume an interrupted collection.
+
+    Shards are written beside the dataset in `<root>.shards/`, merged, and removed. A folder with its final name is
+    complete, so that a killed run loses at most the shards it was writing. A job with `shard` writes its own shards
+    and merges nothing.
+
+    Returns:
+        The folder of the dataset, or of the shards for a job.
+
+    Raises:
+        FileExistsError: The folder has anything but this very dataset, or shards with other settings.
+        BlockingIOError: Another process is collecting this dataset, or this job's part of it.
+        ValueError: There are more jobs than shards, or a shard is incomplete.
+    """
+    job = Job.parse(config.shard) if config.shard else None
+    with sole_writer(config.output_root, job.lock_name if job else None):
+        return _collect(config, job)
+
+
+def _collect(config: CollectConfig, job: Job | None) -> Path:
+    root = config.output_root
+    folder = shards_folder(root)
+    if _is_complete(config, root):
+        # A run that was killed at its very end may have left the shards.
+        shutil.rmtree(folder, ignore_errors=True)
+        print(f"{root} is already complete.")
+        return root
+    shards = plan_shards(config)
+    mine = job.select(shards) if job else shards
+    folder.mkdir(parents=True, exist_ok=True)
+    if finished := _count_finished(shards, folder):
+        print(f"{finished} of {len(shards)} shards are already in {folder}.")
+    start = time.monotonic()
+    with quiet():
+        write_missing_shards(mine, folder, config.num_workers)
+    if job:
+        print(
+            f"Job {config.shard} is done: {_count_finished(shards, folder)} of {len(shards)} shards are in {folder}. "
+            "When all are there, the same command without --shard merges them."
+        )
+        return folder
+    records = [ShardRecord.load(folder / shard.name) for shard in shards]
+    print(f"Merging {len(shards)} shards")
+    with appears_whole(root) as temporary:
+        with quiet():
+            merge_datasets([folder / shard.name for shard in shards], config.repo_id, temporary)
+        seconds = time.monotonic() - start
+        _write_record(temporary, config, records, seconds)
+    shutil.rmtree(folder)
+    _print_summary(root, records, seconds)
+    return root
+
+
+def _is_complete(config: CollectConfig, root: Path) -> bool:
+    if not root.exists():
+        return False
+    record = root / COLLECTION_RECORD
+    if not record.exists():
+        raise FileExistsError(
+            f"{root} exists and was not made by `lerobot-wm collect`: give another --root or remove it."
+        )
+    found = json.loads(record.read_text())["config"]
+    check_same_settings(found, config.identity(), f"{root} is a dataset", "give another --root or remove it")
+    return True
+
+
+def _count_finished(shards: list[Shard], folder: Path) -> int:
+    """Count the finished shards in a folder; other shards there are an error, as are incomplete ones."""
+    planned = {shard.name: shard for shard in shards}
+    fix = "use the same flags again, give another --root, or remove it"
+    found = [path for path in sorted(folder.iterdir()) if path.suffix != UNFINISHED]
+    for path in found:
+        if path.name not in planned:
+            raise FileExistsError(
+                f"{path} is a shard of another collection, with other --tasks or more episodes: {fix}."
+            )
+        made_of = ShardRecord.load(path).made_of
+        check_same_settings(made_of, planned[path.name].made_of(), f"{path} is a shard", fix)
+    return len(found)
 
 
 def write_missing_shards(shards: list[Shard], folder: Path, num_workers: int) -> None:
-    """Write the shards that `folder` does not hold yet, with a progress bar over all episodes."""
+    """Write the shards that are not in `folder` yet, with a progress bar over all episodes."""
     missing = [shard for shard in shards if not (folder / shard.name).exists()]
     total = sum(shard.count for shard in shards)
     done = total - sum(shard.count for shard in missing)
@@ -48,20 +134,20 @@ def write_missing_shards(shards: list[Shard], folder: Path, num_workers: int) ->
 
 
 def _write_in_parallel(shards: list[Shard], folder: Path, num_workers: int, bar: tqdm) -> None:
-    # Workers are forked from a server that has imported LeRobot once and holds no threads and no OpenGL.
+    # Workers are forked from a server that imports LeRobot once and has neither threads nor OpenGL.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["lerobot_wm.collect.command"])
-    finished = context.SimpleQueue()
+    saved = context.SimpleQueue()
     with (
-        ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(finished,)) as pool,
+        ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(saved,)) as pool,
         workers_interrupted(),
     ):
-        with interrupts_held():
-            pending = {pool.submit(_write_and_count, shard, folder) for shard in shards}
+        with delay_interrupts():
+            pending = {pool.submit(_write_in_worker, shard, folder) for shard in shards}
         while pending:
             done, pending = wait(pending, timeout=0.2, return_when=FIRST_EXCEPTION)
-            while not finished.empty():
-                finished.get()
+            while not saved.empty():
+                saved.get()
                 bar.update()
             if any(future.exception() is not None for future in done):
                 pool.shutdown(cancel_futures=True)
@@ -69,42 +155,35 @@ def _write_in_parallel(shards: list[Shard], folder: Path, num_workers: int, bar:
                 future.result()
 
 
-_episodes_saved: "SimpleQueue[None]"  # of a worker: one item per episode it has saved
+# In a worker: receives one item for each saved episode.
+_episodes_saved: "SimpleQueue[None]"
 
 
-def _start_worker(finished: "SimpleQueue[None]") -> None:
+def _start_worker(saved: "SimpleQueue[None]") -> None:
     global _episodes_saved
-    _episodes_saved = finished
+    _episodes_saved = saved
     end_with_parent()
     silence()
 
 
-def _write_and_count(shard: Shard, folder: Path) -> None:
-    with explained_to_parent():
+def _write_in_worker(shard: Shard, folder: Path) -> None:
+    with errors_as_lines():
         write_shard(shard, folder, on_episode=lambda: _episodes_saved.put(None))
 
 
-def write_collection_record(
-    root: Path, config: dict[str, Any], records: list[ShardRecord], seconds: float
-) -> None:
-    """Write how a dataset came about into its meta folder; episodes are in dataset order.
-
-    Args:
-        root: the dataset's folder.
-        config: what its content depends on.
-        records: those of its shards, in order.
-        seconds: wall time of the (last) run.
-    """
+def _write_record(root: Path, config: CollectConfig, records: list[ShardRecord], seconds: float) -> None:
+    """Write how the dataset was collected into its meta folder; episodes are in the dataset's order."""
     episodes = [asdict(episode) for record in records for episode in record.episodes]
     for index, episode in enumerate(episodes):
         episode["episode_index"] = index
     failures: dict[str, Counter[int]] = defaultdict(Counter)
     for record in records:
         failures[record.episodes[0].task].update(record.failures)
+    identity = config.identity()
     content = {
-        "config": config,
+        "config": identity,
         "versions": versions(),
-        "experts": {task: expert_name(task) for task in config["tasks"]},
+        "experts": {task: expert_name(task) for task in identity["tasks"]},
         "failed_attempts": {
             task: dict(sorted(counts.items())) for task, counts in failures.items() if counts
         },
@@ -114,11 +193,11 @@ def write_collection_record(
     (root / COLLECTION_RECORD).write_text(json.dumps(content, indent=1))
 
 
-def print_summary(root: Path, records: list[ShardRecord], seconds: float) -> None:
-    """Print a table per task.
+def _print_summary(root: Path, records: list[ShardRecord], seconds: float) -> None:
+    """Print a table with a row per task.
 
-    steps: mean length; failed: attempts that did not succeed; retried: episodes that needed more than
-    one; moved: episodes collected on another variation than planned; seconds: of the workers together.
+    steps: mean length; failed: attempts without success; retried: episodes that needed more than one attempt; moved:
+    episodes collected on another variation than planned; seconds: sum over all workers.
     """
     by_task: dict[str, list[ShardRecord]] = defaultdict(list)
     for record in records:
@@ -143,102 +222,11 @@ def print_summary(root: Path, records: list[ShardRecord], seconds: float) -> Non
     Console().print(table)
 
 
-def collect(config: CollectConfig) -> Path:
-    """Collect a dataset or a job's share of it, or go on where that was interrupted.
-
-    Shards are written beside the dataset in `<root>.shards/`, merged, and removed. A folder that appears
-    under its final name is complete, so that a killed run loses at most the shards in work. A job with
-    `shard` writes its own shards there and merges nothing.
-
-    Returns:
-        The dataset's folder; for a job that of the shards.
-
-    Raises:
-        FileExistsError: if the folder holds anything but this very dataset, or shards of other settings.
-        BlockingIOError: if another process collects this dataset, or this share of it.
-        ValueError: if there are more jobs than shards, or a shard was not copied whole.
-    """
-    with sole_writer(config.output_root, config.shard and config.shard.replace("/", "-of-")):
-        return _collect(config)
-
-
-def _collect(config: CollectConfig) -> Path:
-    root = config.output_root
-    folder = shards_folder(root)
-    if _is_complete(config, root):
-        shutil.rmtree(folder, ignore_errors=True)  # left by a run killed at its very end
-        print(f"{root} is already complete.")
-        return root
-    shards = plan_shards(config)
-    mine = Share.parse(config.shard).of(shards) if config.shard else shards
-    folder.mkdir(parents=True, exist_ok=True)
-    finished = _finished(shards, folder)
-    if finished:
-        print(f"{finished} of {len(shards)} shards are in {folder} already.")
-    _remove_unfinished(mine, folder)
-    start = time.monotonic()
-    with quiet():
-        write_missing_shards(mine, folder, config.num_workers)
-    if config.shard:
-        print(
-            f"Job {config.shard} is done: {_finished(shards, folder)} of {len(shards)} shards are in {folder}. "
-            "When all are there, the same command without --shard merges them."
-        )
-        return folder
-    records = [ShardRecord.load(folder / shard.name) for shard in shards]
-    merged = folder / f"{TEMPORARY_PREFIX}merged"
-    shutil.rmtree(merged, ignore_errors=True)
-    print(f"Merging {len(shards)} shards")
-    with quiet():
-        merge_datasets([folder / shard.name for shard in shards], config.repo_id, merged)
-    seconds = time.monotonic() - start
-    write_collection_record(merged, config.identity(), records, seconds)
-    merged.rename(root)
-    shutil.rmtree(folder)
-    print_summary(root, records, seconds)
-    return root
-
-
 def push(config: CollectConfig) -> None:
-    """Upload the finished dataset of a configuration, with a card that says how it came about."""
+    """Upload the complete dataset, with a card that says how it was collected."""
     record = json.loads((config.output_root / COLLECTION_RECORD).read_text())
     dataset = LeRobotDataset(config.repo_id, root=config.output_root)
     push_demonstrations(dataset, {**record, "config": config.identity()}, config.private, config.license)
-
-
-def _is_complete(config: CollectConfig, root: Path) -> bool:
-    if not root.exists():
-        return False
-    record = root / COLLECTION_RECORD
-    if not record.exists():
-        raise FileExistsError(
-            f"{root} exists and was not made by `lerobot-wm collect`; give another --root or remove it."
-        )
-    found = json.loads(record.read_text())["config"]
-    refuse_difference(found, config.identity(), f"{root} holds a dataset", "give another --root or remove it")
-    return True
-
-
-def _finished(shards: list[Shard], folder: Path) -> int:
-    """How many of a collection's shards are finished in `folder`; refuse it where it holds any other, or a torn one."""
-    planned = {shard.name: shard for shard in shards}
-    mend = "repeat the flags it was made with, give another --root, or remove it"
-    found = [path for path in sorted(folder.iterdir()) if not path.name.startswith(TEMPORARY_PREFIX)]
-    for path in found:
-        if path.name not in planned:
-            raise FileExistsError(
-                f"{path} is no shard of this collection: made with other --tasks or more episodes; {mend}."
-            )
-        made_of = ShardRecord.load(path).made_of
-        refuse_difference(made_of, planned[path.name].made_of(), f"{path} is a shard", mend)
-    return len(found)
-
-
-def _remove_unfinished(shards: list[Shard], folder: Path) -> None:
-    """Remove what killed runs left of these shards; those of other jobs may be in work."""
-    for shard in shards:
-        for unfinished in folder.glob(f"{TEMPORARY_PREFIX}{shard.name}-*"):
-            shutil.rmtree(unfinished)
 
 
 def main() -> None:
@@ -246,12 +234,12 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING)
     try:
         config = draccus.parse(CollectConfig, args=sys.argv[1:])
-        if config.push_to_hub:
-            check_can_push(config.repo_id)
-        collect(config)
     except draccus.ParsingError as error:
-        # Why CollectConfig refused its flags is the cause.
+        # The error of CollectConfig is the cause.
         sys.exit(f"lerobot-wm collect: {error} {error.__cause__ or ''}")
+    if config.push_to_hub:
+        check_can_push(config.repo_id)
+    collect(config)
     if config.push_to_hub and config.shard is None:
         push(config)
 

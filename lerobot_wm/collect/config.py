@@ -1,4 +1,4 @@
-"""The flags of `lerobot-wm collect`, and the shards they ask for."""
+"""The flags of `lerobot-wm collect`, and the shards that they plan."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from lerobot_wm.constants import CAMERA_NAME, IMAGE_SIZE, MAX_EPISODE_STEPS, REP
 from lerobot_wm.envs.cameras import parse_cameras
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import check_variation_set, parse_variations
-from lerobot_wm.system import Share
+from lerobot_wm.workers import Job
 
 
 @dataclass
@@ -29,26 +29,26 @@ class CollectConfig:
     episodes_per_task: int = 130
     # Variations to collect on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
     variations: str = "0-9"
-    # Set of variations: 42, for training and reported results, 43, for choosing settings and for probes, or 44.
+    # Set of variations: 42 for training and reported results, 43 for choosing settings and for probes, or 44.
     variation_set: int = REPORTED_VARIATION_SET
     # Standard deviation of the Gaussian noise added to the expert's clipped actions.
     noise: float = 0.3
     # Steps kept after the first success, so that successful observations are in the data.
     steps_after_success: int = 8
-    # Attempts at a variation before its episode is given to the next variation.
+    # Attempts at a variation before its episode is collected on the next one.
     max_attempts: int = 5
     # Height and width of the images in pixels.
     image_size: int = IMAGE_SIZE
     # A camera of the simulator, or several separated by commas: corner2,topview.
     camera_name: str = CAMERA_NAME
-    # Seed of the noise; the dataset is the same for a seed whatever num_workers.
+    # Seed of the noise; the same seed gives the same dataset for any num_workers.
     seed: int = 0
     # Processes that collect in parallel.
     num_workers: int = 2
-    # Of several jobs, the one this is: 1/4 is the first of four. Each job collects its share of the shards into
-    # `<root>.shards`; when all are in one such folder, the same command without this flag merges them.
+    # Which of several jobs this is: 1/4 is the first of four. Each job writes its part of the shards into
+    # `<root>.shards`; when all are in one folder, the same command without this flag merges them.
     shard: str | None = None
-    # Upload the dataset as repo_id when it is complete, also where it was so before.
+    # Upload the dataset as repo_id when it is complete, even if an earlier run completed it.
     push_to_hub: bool = False
     # Upload to a private repository.
     private: bool = False
@@ -57,14 +57,14 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        if self.root is None:  # else the name is no folder
+        if self.root is None:
             validate_repo_id(self.repo_id)
         resolve_tasks(self.tasks)
         parse_variations(self.variations)
         check_variation_set(self.variation_set)
         parse_cameras(self.camera_name)
         if self.shard is not None:
-            Share.parse(self.shard)
+            Job.parse(self.shard)
         limits = {
             "episodes_per_task": (1, None),
             "noise": (0, None),
@@ -86,7 +86,7 @@ class CollectConfig:
         return Path(self.root) if self.root is not None else HF_LEROBOT_HOME / self.repo_id
 
     def identity(self) -> dict[str, Any]:
-        """Everything the content of the dataset depends on."""
+        """All settings that the content of the dataset depends on."""
         return {
             "tasks": list(resolve_tasks(self.tasks)),
             "episodes_per_task": self.episodes_per_task,

@@ -1,4 +1,4 @@
-"""One scripted demonstration: an expert's actions with noise, recorded as they were executed."""
+"""One scripted demonstration: an expert's actions plus noise, recorded as they were executed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,8 +30,14 @@ from lerobot_wm.envs.tasks import expert_name, task_description, task_id
 class Demonstration:
     """A successful episode of T steps, without images.
 
-    physics: (T, n) simulator states at o_t, for drawing; states: (T, 39); actions: (T, 4) float32 in [-1, 1];
-    dense_rewards: (T,); successes: (T,) bool, True where step t ended in success.
+    Attributes:
+        task: Its task.
+        variation: Its variation.
+        physics: (T, n) simulator states at o_t, for drawing.
+        states: (T, 39) Meta-World's full states.
+        actions: (T, 4) float32 in [-1, 1].
+        dense_rewards: (T,) Meta-World's shaped rewards.
+        successes: (T,) bool, True where step t ended in success.
     """
 
     task: str
@@ -53,9 +59,9 @@ def demonstrate(
 ) -> Demonstration | None:
     """Let the task's scripted expert try a variation; None if it has not succeeded after `max_steps` steps.
 
-    The expert's raw actions reach +-12. They are clipped to [-1, 1], Gaussian noise of standard deviation
-    `noise` is added, and the sum is clipped again. The episode goes on for `steps_after_success` steps after
-    the first success: cut right there it would hold no successful observation, as step t ends in o_{t+1}.
+    The expert's raw actions reach +-12. They are clipped to [-1, 1], Gaussian noise of standard deviation `noise` is
+    added, and the sum is clipped again. The episode continues for `steps_after_success` steps after the first success:
+    without them it would have no successful observation, because step t ends in o_{t+1}.
     """
     expert = getattr(metaworld.policies, expert_name(simulation.task))()
     state = simulation.reset(variation)
@@ -66,12 +72,12 @@ def demonstrate(
         action = np.clip(action + rng.normal(0.0, noise, action.shape), -1.0, 1.0).astype(np.float32)
         physics.append(simulation.save())
         states.append(state)
-        outcome = simulation.step(action)
+        result = simulation.step(action)
         actions.append(action)
-        dense_rewards.append(outcome.dense_reward)
-        successes.append(outcome.success)
-        state = outcome.state
-        if outcome.success and last_step == max_steps:
+        dense_rewards.append(result.dense_reward)
+        successes.append(result.success)
+        state = result.state
+        if result.success and last_step == max_steps:
             last_step = t + steps_after_success
         if t >= last_step:
             break
@@ -91,14 +97,14 @@ def demonstrate(
 def dataset_frames(
     demonstration: Demonstration, simulation: Simulation, renderers: Mapping[str, Renderer]
 ) -> list[dict[str, Any]]:
-    """Draw a demonstration and lay it out as LeRobot frames (see data/schema.py).
+    """Render a demonstration and convert it to LeRobot frames (see data/schema.py).
 
-    Images are drawn only here, after success is known: a failed attempt costs physics alone.
+    Images are rendered only for successes, so that a failed attempt costs only its physics.
 
     Args:
-        demonstration: what happened.
-        simulation: of the demonstration's task.
-        renderers: image feature -> what draws it.
+        demonstration: The demonstration.
+        simulation: A simulation of its task.
+        renderers: Image feature -> renderer.
     """
     demo = demonstration
     done = np.logical_or.accumulate(demo.successes)

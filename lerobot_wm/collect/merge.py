@@ -1,8 +1,8 @@
-"""Many small LeRobotDatasets of one kind become one, each file of it written once.
+"""Merging many small LeRobotDatasets into one, with each file written once.
 
-LeRobot's own `aggregate_datasets` writes the growing video and tables again for every dataset it adds: its time
-grows with the square of their number. The tables here are the same, byte for byte, as long as each fits into one
-file, and the video holds the same packets; where they do not fit, a file may end one dataset earlier or later.
+LeRobot's own `aggregate_datasets` rewrites the growing video and tables for every dataset that it adds, so that its
+time grows with the square of their number. The result here is the same: equal bytes of tables that fit into one file,
+and equal packets of video. Larger outputs may be split into files one dataset earlier or later.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -35,25 +35,18 @@ from lerobot.datasets.utils import (
 )
 from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
 
-from lerobot_wm.data.check import check_dataset
-
-type ChunkFile = tuple[int, int]  # a file's numbers: of its chunk, and in it
-type VideoIndexState = dict[str, dict[str, Any]]  # by camera: where its files went, as LeRobot notes it
+# (chunk index, file index) of a file.
+type Place = tuple[int, int]
 
 
 def merge_datasets(sources: list[Path], repo_id: str, root: Path) -> None:
     """Merge datasets of the same features, frame rate and codec, in their order, into one.
 
     Args:
-        sources: their folders; each dataset is small enough for one data file and one file of episodes.
-        repo_id: repository id of the result.
-        root: its folder; must not exist yet.
-
-    Raises:
-        DatasetError: a source is not whole.
+        sources: Their folders; each dataset is complete, and fits into one data file and one file of episodes.
+        repo_id: Repository id of the result.
+        root: Folder of the result; must not exist yet.
     """
-    for source in sources:
-        check_dataset(repo_id, source)
     first = LeRobotDatasetMetadata(repo_id, root=sources[0])
     merged = LeRobotDatasetMetadata.create(
         repo_id,
@@ -68,7 +61,7 @@ def merge_datasets(sources: list[Path], repo_id: str, root: Path) -> None:
     merged.tasks = pd.DataFrame({"task_index": range(len(names))}, index=pd.Index(names, name="task"))
     episodes = [pd.read_parquet(source / EPISODES_DIR) for source in sources]
 
-    videos: list[VideoIndexState] = [{} for _ in sources]
+    videos: list[dict[str, Any]] = [{} for _ in sources]
     for key in merged.video_keys:
         _merge_videos(key, sources, episodes, merged, videos)
     data_places = _places_of_tables(DATA_DIR, sources, merged)
@@ -82,7 +75,7 @@ def merge_datasets(sources: list[Path], repo_id: str, root: Path) -> None:
     merged.info.splits = {"train": f"0:{merged.info.total_episodes}"}
     write_tasks(merged.tasks, root)
     write_info(merged.info, root)
-    # LeRobot returns them in another order each time.
+    # LeRobot returns them in a different order each time.
     stats = aggregate_stats([load_stats(source) for source in sources])
     write_stats(dict(sorted(stats.items())), root)
 
@@ -92,10 +85,10 @@ def _merge_videos(
     sources: list[Path],
     episodes: list[pd.DataFrame],
     merged: LeRobotDatasetMetadata,
-    videos: list[VideoIndexState],
+    videos: list[dict[str, Any]],
 ) -> None:
-    """Write the videos of the camera `key`, and note in `videos` where those of each source went."""
-    files: list[tuple[int, ChunkFile, Path]] = []
+    """Write the videos of the camera `key`, and note in `videos` where those of each source are now."""
+    files: list[tuple[int, Place, Path]] = []
     for i, table in enumerate(episodes):
         columns = [f"videos/{key}/chunk_index", f"videos/{key}/file_index"]
         for chunk, file in sorted(set(table[columns].itertuples(index=False, name=None))):
@@ -125,7 +118,7 @@ def _merge_videos(
 def _data_tables(
     sources: list[Path], tasks: list[pd.DataFrame], merged: LeRobotDatasetMetadata
 ) -> Iterator[pd.DataFrame]:
-    """Each source's rows, numbered to follow those of the source before."""
+    """The rows of each source, numbered to follow those of the one before."""
     first_episode = first_frame = 0
     for source, source_tasks in zip(sources, tasks, strict=True):
         table = pd.read_parquet(source / DATA_DIR)
@@ -140,12 +133,12 @@ def _data_tables(
 
 def _episode_tables(
     episodes: list[pd.DataFrame],
-    places: list[ChunkFile],
-    data_places: list[ChunkFile],
-    videos: list[VideoIndexState],
+    places: list[Place],
+    data_places: list[Place],
+    videos: list[dict[str, Any]],
     merged: LeRobotDatasetMetadata,
 ) -> Iterator[pd.DataFrame]:
-    """Each source's episodes, numbered to follow those that `merged` counts, and counted there."""
+    """The episodes of each source, numbered to follow those counted in `merged`, and added to its counts."""
     for table, place, data_place, source_videos in zip(episodes, places, data_places, videos, strict=True):
         shifted = update_meta_data(
             table,
@@ -159,7 +152,7 @@ def _episode_tables(
         yield shifted
 
 
-def _places_of_tables(folder: str, sources: list[Path], merged: LeRobotDatasetMetadata) -> list[ChunkFile]:
+def _places_of_tables(folder: str, sources: list[Path], merged: LeRobotDatasetMetadata) -> list[Place]:
     sizes = [
         sum(get_parquet_file_size_in_mb(file) for file in (source / folder).rglob("*.parquet"))
         for source in sources
@@ -167,9 +160,9 @@ def _places_of_tables(folder: str, sources: list[Path], merged: LeRobotDatasetMe
     return _places(sizes, merged.info.data_files_size_in_mb, merged.info.chunks_size)
 
 
-def _places(sizes: list[float], limit: float, chunk_size: int) -> list[ChunkFile]:
-    """The chunk and file each goes to, by their sizes in MB: a new file where one would reach the limit."""
-    places: list[ChunkFile] = []
+def _places(sizes: list[float], limit: float, chunk_size: int) -> list[Place]:
+    """Where each source is written, given their sizes in MB: a new file begins where one would reach the limit."""
+    places: list[Place] = []
     place, filled = (0, 0), 0.0
     for size in sizes:
         if places and filled + size >= limit:
@@ -181,12 +174,12 @@ def _places(sizes: list[float], limit: float, chunk_size: int) -> list[ChunkFile
 
 def _write(
     tables: Iterable[pd.DataFrame],
-    places: list[ChunkFile],
+    places: list[Place],
     root: Path,
     pattern: str,
     to_parquet: Callable[[pd.DataFrame, Path], object],
 ) -> None:
-    """Write neighbours that go to the same place into one file."""
+    """Write consecutive tables with the same place into one file."""
     for (chunk, file), members in groupby(zip(places, tables, strict=True), key=itemgetter(0)):
         path = root / pattern.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,6 @@
-"""What a finished shard says of itself, in its `shard.json`."""
+"""Shards of a collection: a few episodes of a task in a LeRobotDataset of their own, with a record in `shard.json`."""
 
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -24,27 +23,31 @@ from lerobot_wm.constants import (
     REWARD,
     ROBOT_TYPE,
 )
-from lerobot_wm.data.schema import check_finite, metaworld_features
+from lerobot_wm.data.schema import metaworld_features
 from lerobot_wm.envs.cameras import image_features
 from lerobot_wm.envs.rendering import Renderer, RenderKey
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import task_id
+from lerobot_wm.files import appears_whole
 
 SHARD_RECORD = "shard.json"
+# About ten seconds of work, which is what a killed worker has to repeat.
+SHARD_EPISODES = 13
+_NUMBERS = (OBS_STATE, OBS_ENV_STATE, ACTION, REWARD, DENSE_REWARD)
 
 
 @dataclass
 class EpisodeRecord:
-    """How an episode came about.
+    """How an episode was collected.
 
-    Args:
-        task: its task.
-        episode: its number within the task.
-        variation: the one it was collected on.
-        moved: whether that is another than planned, the expert having failed there.
-        attempt: failures on this variation before it.
-        seed: entropy of the noise's np.random.SeedSequence.
-        length: frames.
+    Attributes:
+        task: Its task.
+        episode: Its number within the task.
+        variation: The variation it was collected on.
+        moved: Whether the expert failed on the planned variation, so that this is another one.
+        attempt: Number of failures on this variation before it.
+        seed: Entropy of the noise's np.random.SeedSequence.
+        length: Number of frames.
     """
 
     task: str
@@ -58,14 +61,14 @@ class EpisodeRecord:
 
 @dataclass
 class ShardRecord:
-    """A finished shard.
+    """The record of a finished shard.
 
-    Args:
-        made_of: what its content depends on, as `Shard.made_of` says it.
-        episodes: how each came about.
-        failures: failed attempts by variation.
-        seconds: wall time.
-        files: bytes of each of its other files, by path.
+    Attributes:
+        made_of: What its content depends on, see `Shard.made_of`.
+        episodes: How each episode was collected.
+        failures: Number of failed attempts by variation.
+        seconds: Wall time.
+        files: Size in bytes of each other file of the shard, by path.
     """
 
     made_of: dict[str, Any]
@@ -76,16 +79,16 @@ class ShardRecord:
 
     @classmethod
     def load(cls, folder: Path) -> "ShardRecord":
-        """Read the record that lies in a finished shard.
+        """Read the record of a finished shard.
 
         Raises:
-            ValueError: it is missing, or a file it names is missing or cut short.
+            ValueError: The record, or a file that it names, is missing or incomplete.
         """
         path = folder / SHARD_RECORD
         data = json.loads(path.read_text()) if path.exists() else {}
         if "files" not in data or not data["files"].items() <= file_sizes(folder).items():
             raise ValueError(
-                f"{folder} is not a whole shard: copy it again, or remove it and it is collected."
+                f"{folder} is an incomplete shard: copy it again, or remove it to have it collected again."
             )
         return cls(
             made_of=data["made_of"],
@@ -97,7 +100,7 @@ class ShardRecord:
 
 
 def file_sizes(folder: Path) -> dict[str, int]:
-    """Bytes of each file of a shard but its record, by path."""
+    """Size in bytes of each file of a shard except its record, by path."""
     return {
         path.relative_to(folder).as_posix(): path.stat().st_size
         for path in sorted(folder.rglob("*"))
@@ -105,14 +108,9 @@ def file_sizes(folder: Path) -> dict[str, int]:
     }
 
 
-SHARD_EPISODES = 13  # some ten seconds of work: what a killed worker has to redo
-TEMPORARY_PREFIX = "unfinished-"
-_FINITE = (OBS_STATE, OBS_ENV_STATE, ACTION, REWARD, DENSE_REWARD)
-
-
 @dataclass(frozen=True)
 class Shard:
-    """Episodes `first` to `first + count - 1` of a task, and all that making them depends on."""
+    """Episodes `first` to `first + count - 1` of a task, and all settings that they depend on."""
 
     task: str
     first: int
@@ -132,30 +130,34 @@ class Shard:
         return f"{self.task}-{self.first:05d}"
 
     def made_of(self) -> dict[str, Any]:
-        """All that its content depends on, the versions of packages too."""
+        """All that its content depends on, including versions of packages."""
         return {**asdict(self), "versions": versions()}
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a trajectory depends on; mujoco's change its fourth decimal."""
+    """Versions of packages that trajectories depend on; they differ in the fourth decimal between mujoco versions."""
     return {name: version(name) for name in ("mujoco", "metaworld", "lerobot", "lerobot_policy_wm")}
 
 
 def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> None:
-    """Collect a shard into `folder / shard.name`; the folder appears only when it is complete.
+    """Collect a shard into `folder / shard.name`; that folder appears only when it is complete.
 
     Args:
-        shard: what to collect.
-        folder: where shards lie.
-        on_episode: called after each finished episode.
+        shard: What to collect.
+        folder: Folder of all shards.
+        on_episode: Called after each finished episode.
 
     Raises:
-        RuntimeError: if the expert fails an episode on every variation, `max_attempts` times each.
-        ValueError: if an observation, action or reward is not finite.
+        RuntimeError: The expert failed an episode on every variation, `max_attempts` times each.
+        ValueError: An observation, action or reward is not finite.
     """
+    with appears_whole(folder / shard.name) as temporary:
+        _write_shard(shard, temporary, on_episode)
+
+
+def _write_shard(shard: Shard, root: Path, on_episode: Callable[[], None]) -> None:
     start = time.monotonic()
-    temporary = folder / f"{TEMPORARY_PREFIX}{shard.name}-{os.getpid()}"
-    dataset = _create_dataset(temporary, shard)
+    dataset = _create_dataset(root, shard)
     simulation = Simulation(shard.task, shard.variation_set)
     render_keys = {
         feature: RenderKey(shard.task, camera, shard.image_size, fast=True)
@@ -166,8 +168,7 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
     for episode in range(shard.first, shard.first + shard.count):
         demonstration = _succeed(shard, episode, simulation, record)
         frames = dataset_frames(demonstration, simulation, renderers)
-        numbers = {key: np.stack([frame[key] for frame in frames]) for key in _FINITE}  # (T, ...) each
-        check_finite(numbers, where=f"{shard.task}, episode {episode}, variation {demonstration.variation}")
+        _check_finite(frames, f"{shard.task}, episode {episode}, variation {demonstration.variation}")
         for frame in frames:
             dataset.add_frame(frame)
         dataset.save_episode()
@@ -176,13 +177,20 @@ def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> N
     for key in render_keys.values():
         Renderer.release(key)
     record.seconds = time.monotonic() - start
-    record.files = file_sizes(temporary)
-    (temporary / SHARD_RECORD).write_text(json.dumps(asdict(record)))
-    temporary.rename(folder / shard.name)
+    record.files = file_sizes(root)
+    (root / SHARD_RECORD).write_text(json.dumps(asdict(record)))
+
+
+def _check_finite(frames: list[dict[str, Any]], name: str) -> None:
+    """LeRobot would write NaN silently."""
+    for t, frame in enumerate(frames):
+        for key in _NUMBERS:
+            if not np.isfinite(frame[key]).all():
+                raise ValueError(f"{name}, frame {t}: {key} is not finite. The episode was not saved.")
 
 
 def _succeed(shard: Shard, episode: int, simulation: Simulation, record: ShardRecord) -> Demonstration:
-    """Try the episode's variation until it succeeds, then the next one, and so on; note what happened."""
+    """Try the planned variation up to `max_attempts` times, then the next one, and so on; add to the record."""
     n = len(shard.variations)
     order = [shard.variations[(episode + offset) % n] for offset in range(n)]
     for variation in order:
@@ -199,8 +207,8 @@ def _succeed(shard: Shard, episode: int, simulation: Simulation, record: ShardRe
                 return demonstration
             record.failures[variation] = record.failures.get(variation, 0) + 1
     raise RuntimeError(
-        f"{shard.task}, episode {episode}: the scripted expert failed {shard.max_attempts} attempts on each of "
-        f"the variations {order} at noise {shard.noise}. Lower --noise, raise --max_attempts or add variations."
+        f"{shard.task}, episode {episode}: the scripted expert failed {shard.max_attempts} attempts on each of the "
+        f"variations {order} with noise {shard.noise}. Lower --noise, raise --max_attempts or add variations."
     )
 
 
@@ -211,11 +219,12 @@ def _create_dataset(root: Path, shard: Shard) -> LeRobotDataset:
         fps=FPS,
         robot_type=ROBOT_TYPE,
         features=metaworld_features(shard.image_size, image_features(shard.cameras).values()),
-        # Full chroma resolution: with yuv420p the 3-pixel red dot that marks reach-v3's goal is lost.
-        # Without mbtree: with it x264, given the same frames, now and then writes other ones (25 of 600 shards of two
-        # episodes on a busy machine; none of 400 without).
+        # Full chroma resolution, because yuv420p loses the 3-pixel red dot that marks the goal of reach-v3.
+        # No mbtree, because with it x264 sometimes encodes the same frames differently (25 of 600 shards of two
+        # episodes on a busy machine; 0 of 400 without it).
         rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=10, extra_options={"mbtree": 0}),
         streaming_encoding=True,
-        encoder_queue_maxsize=MAX_EPISODE_STEPS,  # a full queue drops frames
+        # A full queue would drop frames.
+        encoder_queue_maxsize=MAX_EPISODE_STEPS,
         encoder_threads=1,
     )

@@ -1,4 +1,4 @@
-"""`lerobot-wm doctor`: is this machine ready? One line per part, `ok` or `mend: how`."""
+"""`lerobot-wm doctor`: check this machine; one line per component, `ok` or `fix:` and what to do."""
 
 import argparse
 import importlib.metadata
@@ -23,11 +23,12 @@ from lerobot_wm.system import cpu_kind, usable_cores
 
 DISTRIBUTION = "lerobot_policy_wm"
 MAIN_PACKAGES = ("lerobot", "torch", "metaworld", "mujoco")
-# Parts of mujoco 4.x that install into the same mujoco/ folder and stay behind after a downgrade.
+# Packages of mujoco 4.x that install into the same mujoco/ folder and remain after a downgrade.
 MUJOCO_LEFTOVERS = ("mujoco-core", "mujoco-studio")
 GL_PACKAGES = "libegl1 libopengl0 libgl1-mesa-dri"
 POLICY_TYPES = ("wm_rssm", "frozen_backbone", "wm_bc", "wm_iql", "e2e_bc", "e2e_iql")
-MIN_FREE_GB = 5.0  # outputs of a full-size run: dataset, frame cache, latents, checkpoints and videos
+# Outputs of a full-size run: dataset, frame cache, latents, checkpoints and videos.
+MIN_FREE_GB = 5.0
 WIDTH = 100
 
 DISCOVERY = """
@@ -44,49 +45,50 @@ class Check:
     """One line of the report.
 
     Attributes:
-        name: what was looked at.
-        found: what is there.
-        mend: how to make it right; empty when it is.
-        needed: False for parts that the pipeline runs without.
+        name: What was checked.
+        found: What was found.
+        fix: What to do; empty if nothing.
+        needed: False for components that the pipeline runs without.
     """
 
     name: str
     found: str
-    mend: str = ""
+    fix: str = ""
     needed: bool = True
 
     @property
     def verdict(self) -> str:
-        """`ok`, or `mend: ` and how."""
-        return f"mend: {self.mend}" if self.mend else "ok" if self.needed else "ok (optional)"
+        """`ok`, or `fix: ` and what to do."""
+        return f"fix: {self.fix}" if self.fix else "ok" if self.needed else "ok (optional)"
 
     @property
     def is_broken(self) -> bool:
         """Whether the pipeline cannot run because of this."""
-        return self.needed and bool(self.mend)
+        return self.needed and bool(self.fix)
 
 
 def check_python() -> Check:
-    """The interpreter's version against the one that pyproject.toml asks for."""
+    """Check the interpreter's version, which pyproject.toml requires too."""
     found = ".".join(map(str, sys.version_info[:3]))
-    mend = "" if sys.version_info >= (3, 12) else "make the environment with Python 3.12 or newer"
-    return Check("Python", f"{found} ({sys.executable})", mend)
+    fix = "" if sys.version_info >= (3, 12) else "create the environment with Python 3.12 or newer"
+    return Check("Python", f"{found} ({sys.executable})", fix)
 
 
 def requirements() -> list[Requirement]:
-    """Our distribution's own dependencies, without those of its extras."""
+    """The dependencies of our distribution, without its extras."""
     declared = [Requirement(line) for line in importlib.metadata.requires(DISTRIBUTION) or []]
     return [r for r in declared if r.marker is None or r.marker.evaluate({"extra": ""})]
 
 
 def check_requirement(requirement: Requirement, installed: dict[str, str]) -> Check:
-    """One dependency's installed version against its range.
+    """Check the installed version of a dependency.
 
     Args:
-        requirement: a line of pyproject.toml's dependencies.
-        installed: version per distribution name (lower case, dashes).
+        requirement: A dependency in pyproject.toml.
+        installed: Version by distribution name (lower case, dashes).
     """
-    wanted = f"{requirement}".split(";")[0].strip()  # with its extras
+    # With its extras, without its marker.
+    wanted = f"{requirement}".split(";")[0].strip()
     version = installed.get(requirement.name)
     if version is None:
         return Check(requirement.name, "not installed", f"pip install '{wanted}'")
@@ -96,10 +98,10 @@ def check_requirement(requirement: Requirement, installed: dict[str, str]) -> Ch
 
 
 def check_packages(installed: dict[str, str]) -> list[Check]:
-    """A line for each main package, one for all others, and one for leftovers of mujoco 4.x.
+    """Check each main package, all others together, and leftovers of mujoco 4.x.
 
     Args:
-        installed: version per distribution name (lower case, dashes).
+        installed: Version by distribution name (lower case, dashes).
     """
     checks = [check_requirement(r, installed) for r in requirements()]
     main = [c for c in checks if c.name in MAIN_PACKAGES]
@@ -115,25 +117,26 @@ def check_packages(installed: dict[str, str]) -> list[Check]:
 
 
 def installed_versions() -> dict[str, str]:
-    """Version per installed distribution (names in lower case, with dashes), of several the one that is imported."""
+    """Version by installed distribution (lower case, dashes); of several versions, the one that is imported."""
     versions: dict[str, str] = {}
     for found in importlib.metadata.distributions():
-        if name := found.metadata["Name"]:  # an installation that was broken off has none
+        # An interrupted installation has no name.
+        if name := found.metadata["Name"]:
             versions.setdefault(name.lower().replace("_", "-"), found.version)
     return versions
 
 
 def last_words(run: subprocess.CompletedProcess[str]) -> str:
-    """Why a process failed: the last line of its errors, or how it ended where it left none."""
+    """The last line that a failed process printed to stderr, or its exit code."""
     lines = run.stderr.strip().splitlines()
     return lines[-1] if lines else f"ended with signal or code {run.returncode}"
 
 
 def check_rendering() -> Check:
-    """Render a real frame in another process, so that a crash of the GL driver is seen, not suffered."""
+    """Render a frame in another process, because a GL driver may crash it."""
     backend = os.environ.get("MUJOCO_GL", "egl" if sys.platform == "linux" else "")
     probe = Path(__file__).with_name("render_probe.py")
-    # -P keeps this folder, with modules named as common packages are, off the probe's import path.
+    # -P keeps this folder out of the import path, because its modules are named like common packages.
     run = subprocess.run(
         [sys.executable, "-P", str(probe)],
         env={**os.environ, **({"MUJOCO_GL": backend} if backend else {})},
@@ -143,12 +146,12 @@ def check_rendering() -> Check:
     name = backend or "default"
     if run.returncode == 0:
         return Check("rendering", f"MUJOCO_GL={name} draws a frame")
-    mend = f"MUJOCO_GL=egl and, on Debian: apt-get install -y --no-install-recommends {GL_PACKAGES}"
-    return Check("rendering", f"MUJOCO_GL={name} fails: {last_words(run)}", mend)
+    fix = f"MUJOCO_GL=egl and, on Debian: apt-get install -y --no-install-recommends {GL_PACKAGES}"
+    return Check("rendering", f"MUJOCO_GL={name} fails: {last_words(run)}", fix)
 
 
 def check_discovery() -> Check:
-    """Whether a plain `lerobot-train` would find the policy types and the environment type."""
+    """Check that LeRobot's own commands find our policy types and environment type."""
     run = subprocess.run([sys.executable, "-P", "-c", DISCOVERY], capture_output=True, text=True)
     if run.returncode != 0:
         return Check(
@@ -165,12 +168,12 @@ def check_discovery() -> Check:
 
 
 def check_cpu() -> Check:
-    """Cores, threads PyTorch uses and whether the CPU computes bfloat16 natively."""
+    """Report cores, PyTorch's threads and whether the CPU computes bfloat16 natively."""
     return Check("CPU", f"{usable_cores()} cores, {torch.get_num_threads()} PyTorch threads, {cpu_kind()}")
 
 
 def check_gpu() -> Check:
-    """The GPU that PyTorch can use, if any."""
+    """Report the GPU that PyTorch can use, if any."""
     if torch.cuda.is_available():
         gpu = torch.cuda.get_device_properties(0)
         bf16 = "yes" if torch.cuda.is_bf16_supported(including_emulation=False) else "no"
@@ -185,52 +188,52 @@ def check_gpu() -> Check:
 
 
 def check_disk(name: str, folder: Path) -> Check:
-    """Free space where outputs go.
+    """Check the free space for outputs.
 
     Args:
-        name: the line's name.
-        folder: a folder, which need not exist yet.
+        name: Name of the check.
+        folder: A folder, which need not exist yet.
     """
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(existing).free / 1e9
-    mend = "" if free >= MIN_FREE_GB else f"free {MIN_FREE_GB:.0f} GB there, or work on another disk"
-    return Check(name, f"{free:.1f} GB free at {folder}", mend)
+    fix = "" if free >= MIN_FREE_GB else f"free {MIN_FREE_GB:.0f} GB there, or work on another disk"
+    return Check(name, f"{free:.1f} GB free at {folder}", fix)
 
 
 def check_hub() -> Check:
-    """Login to the Hugging Face Hub, needed only to push. Looks for a token, makes no network call."""
-    login = "a token is here (hf auth whoami tests it)" if get_token() else "none; to push: hf auth login"
+    """Look for a token of the Hugging Face Hub, which only pushing needs, without using the network."""
+    login = "token found (test it with: hf auth whoami)" if get_token() else "none; to push: hf auth login"
     return Check("Hub login", login, needed=False)
 
 
 def diagnose() -> list[Check]:
-    """Run every check, in the order in which a broken part would be mended."""
+    """Run all checks, in the order in which problems should be fixed."""
     single: list[Callable[[], Check]] = [check_rendering, check_discovery, check_cpu, check_gpu, check_hub]
     return [
         check_python(),
         *check_packages(installed_versions()),
-        *[check() for check in tqdm(single, desc="Checking", unit="part", leave=False)],
+        *[check() for check in tqdm(single, desc="Checking", unit="check", leave=False)],
         check_disk("disk, this folder", Path.cwd()),
         check_disk("disk, HF_HOME", Path(constants.HF_HOME)),
     ]
 
 
 def render(checks: list[Check]) -> Table:
-    """The checks as a table of part, what was found and the verdict."""
-    table = Table("part", "found", "verdict", title="lerobot-wm doctor")
+    """The checks as a table."""
+    table = Table("component", "found", "verdict", title="lerobot-wm doctor")
     for check in checks:
-        style = "red" if check.is_broken else "yellow" if check.mend else "green"
+        style = "red" if check.is_broken else "yellow" if check.fix else "green"
         table.add_row(check.name, escape(check.found), f"[{style}]{escape(check.verdict)}[/]")
     return table
 
 
 def main() -> None:
-    """Print the report; exit with 1 when a needed part is broken."""
+    """Print the report; exit with 1 if a needed component is broken."""
     argparse.ArgumentParser(prog="lerobot-wm doctor", description=__doc__).parse_args()
     checks = diagnose()
     console = Console()
     console.print(render(checks), width=min(console.width, WIDTH))
     broken = [check.name for check in checks if check.is_broken]
     if broken:
-        sys.exit(f"lerobot-wm doctor: mend first: {', '.join(broken)}.")
+        sys.exit(f"lerobot-wm doctor: fix first: {', '.join(broken)}.")
     console.print("Ready.")

@@ -1,4 +1,4 @@
-"""`lerobot-wm expert`: the scripted expert as an arm, one rollout without noise on each variation."""
+"""`lerobot-wm expert`: roll out the scripted expert without noise, once on each variation, as a reference."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.envs.variations import check_variation_set, is_seen, parse_variations
 from lerobot_wm.files import write_whole
-from lerobot_wm.quiet import quiet, silence
 from lerobot_wm.records import Record, new_records, record_line
+from lerobot_wm.system import quiet, silence
 from lerobot_wm.tables import table_by_split, terminal_tables
 from lerobot_wm.workers import map_in_workers
 
@@ -32,11 +32,11 @@ class ExpertConfig:
     output_dir: Path
     # A task, a set (mt6, mt10, mt50) or a comma-separated list.
     tasks: str = "mt6"
-    # Set of variations: 42, for reporting results; 43, for choosing settings and for probes; 44, for confirming.
+    # Set of variations: 42 for reported results, 43 for choosing settings and for probes, 44 for a final choice.
     variation_set: int = REPORTED_VARIATION_SET
     # Variations to roll out on: ranges and numbers from 0 to 49, such as 0-9 or 0-4,7.
     variations: str = f"0-{NUM_VARIATIONS - 1}"
-    # Steps after which a rollout is a failure, at most 500; as --env.episode_length of `lerobot-wm eval`.
+    # Steps after which a rollout is a failure, at most 500; like --env.episode_length of `lerobot-wm eval`.
     episode_length: int = MAX_EPISODE_STEPS
     # Name of the settings in records.
     preset: str = "custom"
@@ -44,11 +44,10 @@ class ExpertConfig:
     num_workers: int = 2
 
     def validate(self) -> None:
-        """Refuse what cannot run.
+        """Check the flags.
 
         Raises:
-            ValueError: a flag names what does not exist.
-            FileExistsError: the records file is there already.
+            ValueError: A flag has an invalid value.
         """
         resolve_tasks(self.tasks)
         check_variation_set(self.variation_set)
@@ -65,24 +64,18 @@ class ExpertConfig:
 
 
 def roll_out_expert(cfg: ExpertConfig) -> list[Record]:
-    """Roll the experts out and write their records, as `lerobot-wm eval` writes a policy's.
+    """Roll out the experts and write their records, as `lerobot-wm eval` does for a policy.
 
     Raises:
-        ValueError: see `ExpertConfig.validate`.
-        FileExistsError, BlockingIOError: see `new_records`.
+        ValueError: See `ExpertConfig.validate`.
+        FileExistsError, BlockingIOError: See `new_records`.
     """
     cfg.validate()
+    tasks = resolve_tasks(cfg.tasks)
     with new_records(cfg.records_file):
-        return _write_records(cfg, resolve_tasks(cfg.tasks))
-
-
-def _write_records(cfg: ExpertConfig, tasks: tuple[str, ...]) -> list[Record]:
-    records = [
-        record
-        for of_task in tqdm(_rollouts(cfg, tasks), total=len(tasks), desc="Rolling out", unit="task")
-        for record in of_task
-    ]
-    write_whole(cfg.records_file, "".join(map(record_line, records)))
+        progress = tqdm(_rollouts(cfg, tasks), total=len(tasks), desc="Rolling out", unit="task")
+        records = [record for task_records in progress for record in task_records]
+        write_whole(cfg.records_file, "".join(map(record_line, records)))
     return records
 
 
@@ -101,8 +94,9 @@ def _roll_out(cfg: ExpertConfig, task: str) -> list[Record]:
 
 
 def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record:
-    """One rollout: as in the environment, success or `episode_length` steps end it, and success is the reward."""
-    rng = np.random.default_rng(0)  # draws nothing that matters: the noise has no width
+    """One rollout, which ends with success or after `episode_length` steps, as in the environment."""
+    # Without effect: the noise is zero.
+    rng = np.random.default_rng(0)
     demonstration = demonstrate(
         simulation, variation, noise=0.0, steps_after_success=0, rng=rng, max_steps=cfg.episode_length
     )

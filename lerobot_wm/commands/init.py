@@ -1,21 +1,19 @@
-"""`lerobot-wm init`: the checkpoint of an untrained policy.
+"""`lerobot-wm init`: write the checkpoint of an untrained policy.
 
-Two controls need one: an RSSM that was never trained, and a frozen image backbone in place of the world model.
+Two baselines need one: an RSSM that was never trained, and a frozen image backbone in place of the world model.
 """
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.files import sole_writer
+from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.files import appears_whole, sole_writer
 
 
 @dataclass
@@ -24,8 +22,8 @@ class InitConfig:
 
     Args:
         policy: `--policy.type=...` and its flags, as in `lerobot-train`.
-        dataset: Gives the sizes and the statistics that scale actions and proprioception.
-        output_dir: The checkpoint is written to its folder `pretrained_model`.
+        dataset: The dataset that gives sizes, and the statistics that scale actions and proprioception.
+        output_dir: The checkpoint is written to `pretrained_model` in this folder.
         seed: Seed of the random weights.
     """
 
@@ -36,34 +34,32 @@ class InitConfig:
 
 
 def initialise(cfg: InitConfig) -> Path:
-    """Write the checkpoint; it appears when it is whole.
+    """Write the checkpoint.
 
     Returns:
         Its folder, for `--world_model_path` and `--policy.world_model_path`.
 
     Raises:
-        FileExistsError: It is there already.
-        BlockingIOError: Another process writes it.
+        FileExistsError: The checkpoint exists already.
+        BlockingIOError: Another process is writing it.
         ValueError: The policy does not fit the dataset.
     """
     folder = cfg.output_dir / PRETRAINED_MODEL_DIR
     with sole_writer(folder):
         if folder.exists():
-            raise FileExistsError(f"{folder} is there already: choose another --output_dir, or remove it.")
+            raise FileExistsError(f"{folder} already exists: choose another --output_dir, or remove it.")
         _write(cfg, folder)
     return folder
 
 
 def _write(cfg: InitConfig, folder: Path) -> None:
-    meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
+    meta = cfg.dataset.metadata()
     set_seed(cfg.seed)
     policy = make_policy(cfg.policy, ds_meta=meta)
-    partial = folder.with_name(f"{PRETRAINED_MODEL_DIR}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    policy.save_pretrained(partial)
-    for processor in make_pre_post_processors(cfg.policy, dataset_stats=meta.stats):
-        processor.save_pretrained(partial)
-    partial.rename(folder)
+    with appears_whole(folder) as temporary:
+        policy.save_pretrained(temporary)
+        for processor in make_pre_post_processors(cfg.policy, dataset_stats=meta.stats):
+            processor.save_pretrained(temporary)
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
-"""`lerobot-wm relabel`: a copy of a dataset whose `next.reward` is another of its columns.
+"""`lerobot-wm relabel`: copy a dataset, with another of its columns as `next.reward`.
 
-Any policy type then learns from that reward, through both training commands.
+Any policy type then learns from that reward, with both training commands.
 """
 
 import json
@@ -19,9 +19,9 @@ from tqdm import tqdm
 
 from lerobot_wm.constants import REWARD
 from lerobot_wm.data.latents import dataset_fingerprint
-from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.schema import RELABEL_RECORD
-from lerobot_wm.files import sole_writer
+from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.files import appears_whole, sole_writer
 
 
 @dataclass
@@ -30,10 +30,10 @@ class RelabelConfig:
 
     Args:
         dataset: The dataset to copy.
-        reward: The column that becomes `next.reward`, such as `next.dense_reward`. IQL on one that is above zero on the
-            way to success needs `--policy.iql.done_key=never`.
+        reward: The column that becomes `next.reward`, such as `next.dense_reward`. IQL needs
+            `--policy.iql.done_key=never` with a reward that is above zero before success.
         output_repo_id: Repository id of the copy.
-        output_root: Its folder; must not exist yet.
+        output_root: Folder of the copy; must not exist yet.
     """
 
     dataset: SourceConfig
@@ -43,56 +43,55 @@ class RelabelConfig:
 
 
 def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_root: Path) -> LeRobotDataset:
-    """Write a copy of `source` with `next.reward` taken from the column `reward`; nothing else differs.
+    """Write a copy of `source` whose `next.reward` is the column `reward`; nothing else differs.
 
-    `meta/relabel.json` says which column it was. The copy is written beside `output_root` and moved there when
-    whole. LeRobot's `modify_features` cannot replace a feature, and leaves the statistics of episodes as they were.
+    `meta/relabel.json` names the column. LeRobot's `modify_features` cannot replace a feature, and does not update the
+    statistics of episodes.
 
     Returns:
         The copy.
 
     Raises:
-        FileExistsError: `output_root` is there already.
-        BlockingIOError: Another process writes it.
-        ValueError: The dataset has no such column, or one of another kind than its `next.reward`, or no `next.reward`.
+        FileExistsError: `output_root` exists already.
+        BlockingIOError: Another process is writing it.
+        ValueError: The dataset has no `next.reward`, or no such column of its type and shape.
     """
     if REWARD not in source.meta.features:
         raise ValueError(
-            f"{source.repo_id} has no '{REWARD}' that could be replaced: name the column where you train, "
+            f"{source.repo_id} has no '{REWARD}' to replace: name the column when you train, with "
             f"--policy.reward_key={reward}."
         )
     kinds = {name: (feature["dtype"], *feature["shape"]) for name, feature in source.meta.features.items()}
     if reward not in kinds or kinds[reward] != kinds[REWARD]:
         alike = [name for name in kinds if name.startswith("next.") and kinds[name] == kinds[REWARD]]
         raise ValueError(
-            f"--reward={reward}: {source.repo_id} has no such column of the kind of its '{REWARD}', "
-            f"{kinds[REWARD]}. Columns of that kind: {', '.join(alike) or 'none'}."
+            f"--reward={reward}: {source.repo_id} has no such column of the type and shape of its '{REWARD}', "
+            f"{kinds[REWARD]}. Columns of that type and shape: {', '.join(alike) or 'none'}."
         )
     with sole_writer(output_root):
         if output_root.exists():
             raise FileExistsError(
-                f"{output_root} is there already: choose another --output_root, or remove it."
+                f"{output_root} already exists: choose another --output_root, or remove it."
             )
-        _write(source, reward, output_root)
+        with appears_whole(output_root) as temporary:
+            _write(source, reward, temporary)
     return LeRobotDataset(output_repo_id, root=output_root)
 
 
-def _write(source: LeRobotDataset, reward: str, output_root: Path) -> None:
-    partial = output_root.with_name(f"{output_root.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
+def _write(source: LeRobotDataset, reward: str, folder: Path) -> None:
     root = Path(source.root)
     files = [
-        path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*") if path.is_file()
+        path for name in ("meta", "data", "videos") for path in (root / name).rglob("*") if path.is_file()
     ]
     for path in tqdm(files, desc="Copying", unit="file"):
-        copy = partial / path.relative_to(root)
+        copy = folder / path.relative_to(root)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, copy)
-    for file in (partial / "data").rglob("*.parquet"):
+    for file in (folder / "data").rglob("*.parquet"):
         table = pq.read_table(file)
         write_table_one_row_group_per_episode(_with_column(table, REWARD, table[reward]), file)
     episodes = _episode_stats(source, reward)
-    for file in (partial / "meta" / "episodes").rglob("*.parquet"):
+    for file in (folder / "meta" / "episodes").rglob("*.parquet"):
         table = pq.read_table(file)
         of_file = [episodes[index] for index in table["episode_index"].to_pylist()]
         for key in episodes[0]:
@@ -101,14 +100,13 @@ def _write(source: LeRobotDataset, reward: str, output_root: Path) -> None:
                 table = _with_column(table, name, pa.array([stats[key].tolist() for stats in of_file]))
         pq.write_table(table, file)
     of_all = aggregate_stats([{REWARD: stats} for stats in episodes])
-    write_stats({**source.meta.stats, **of_all}, partial)
+    write_stats({**source.meta.stats, **of_all}, folder)
     record = {
         "reward": reward,
         "source_repo_id": source.repo_id,
         "source_fingerprint": dataset_fingerprint(root),
     }
-    (partial / RELABEL_RECORD).write_text(json.dumps(record, indent=2) + "\n")
-    partial.replace(output_root)
+    (folder / RELABEL_RECORD).write_text(json.dumps(record, indent=2) + "\n")
 
 
 def _with_column(table: pa.Table, name: str, values: pa.ChunkedArray | pa.Array) -> pa.Table:

@@ -1,7 +1,7 @@
-"""Render one small frame with MuJoCo and print the GL backend; fail when the frame is empty.
+"""Render a small frame with MuJoCo and print the GL backend; fail if the frame is empty.
 
-A script of its own, importing nothing of this package, so that a crash inside a GL driver ends only the
-process that runs it: `lerobot-wm doctor` and scripts/setup.sh start it and look at its exit code.
+`lerobot-wm doctor` and scripts/setup.sh run this script in a process of its own, which a crash inside a GL driver may
+end. It imports nothing of this package.
 """
 
 import os
@@ -20,10 +20,10 @@ SCENE = """
 
 
 def main() -> None:
-    """Draw a red sphere on a black ground, 32x32 pixels, and look for both in the image.
+    """Render a red sphere on a black background, 32x32 pixels, and check both.
 
     Raises:
-        RuntimeError: if the GL backend gives an image without the sphere or without the ground.
+        RuntimeError: The image lacks the sphere or the background.
     """
     model = mujoco.MjModel.from_xml_string(SCENE)
     data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""Camera frames decoded once, at a model's image size, into uint8 and memory-mapped from a file beside the dataset."""
+"""Camera frames, decoded once at a model's image size into a memory-mapped uint8 file beside the dataset."""
 
 import logging
 import math
@@ -18,9 +18,10 @@ from numpy.lib.format import open_memmap
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wm.data.check_meta import MEND, one_line
+from lerobot_wm.data.check import FIX, DatasetError, brief
 from lerobot_wm.data.latents import dataset_fingerprint
-from lerobot_wm.data.source import DatasetError, is_snapshot
+from lerobot_wm.data.source import is_snapshot
+from lerobot_wm.files import appears_whole, sole_writer
 from lerobot_wm.nn.images import resize_images
 from lerobot_wm.system import usable_cores
 
@@ -29,25 +30,27 @@ logger = logging.getLogger(__name__)
 _VIDEO_CHANNELS = 3
 CACHE_VARIABLE = "LEROBOT_WM_CACHE"
 
-# Of frames that each thread holds at once: bounds memory for long episodes of large images.
+# Size of the frames that a thread decodes at once, which bounds memory for long episodes of large images.
 _CHUNK_BYTES = 2**25
-_RESIZED_AT_ONCE = 8  # frames, which are four times as large then
-_MAX_THREADS = 16  # each of which holds a chunk two or three times
+# Frames that are resized at once; in float32 they take four times the memory.
+_RESIZED_AT_ONCE = 8
+# Each thread holds its chunk two or three times.
+_MAX_THREADS = 16
 
 
 def cache_root(dataset_root: Path) -> Path:
-    """Where what is derived from a dataset lives: `<root>.cache` beside it, or under $LEROBOT_WM_CACHE.
+    """The folder for files derived from a dataset: `<root>.cache` beside it, or a folder in $LEROBOT_WM_CACHE.
 
-    Of a snapshot in a cache of the Hub, `$HF_LEROBOT_HOME/lerobot_wm/OWNER--NAME--COMMIT.cache`: beside it, `hf cache
-    prune` would take it for a snapshot that no branch leads to, and remove it.
+    For a snapshot in a cache of the Hub it is `$HF_LEROBOT_HOME/lerobot_wm/OWNER--NAME--COMMIT.cache`: beside the
+    snapshot, `hf cache prune` would remove it as a snapshot without a branch.
 
-    Decoded frames are made again when needed. The latents of a training are too when it is started anew, but one that
-    is to be resumed needs them where they are.
+    Decoded frames can be removed at any time. A run that will be resumed needs its latents where they are.
 
     Raises:
-        PermissionError: The place cannot be written.
+        PermissionError: The folder cannot be written.
     """
-    dataset_root = Path(os.path.abspath(dataset_root))  # of `.` the name, and what is beside it
+    # An absolute path, because `.` has neither a name nor a place beside it.
+    dataset_root = Path(os.path.abspath(dataset_root))
     place = os.environ.get(CACHE_VARIABLE)
     if place:
         root = Path(place) / dataset_root.name
@@ -60,23 +63,23 @@ def cache_root(dataset_root: Path) -> Path:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PermissionError(
-            f"Cannot write the decoded frames to {root} ({error.strerror}): "
-            f"set {CACHE_VARIABLE} to a folder with room for them."
+            f"Cannot write decoded frames to {root} ({error.strerror}): set {CACHE_VARIABLE} to a folder with room for "
+            "them."
         ) from error
     return root
 
 
 class CameraCache:
-    """One camera's frames for the whole dataset, (N, H, W, C) uint8 in order of the absolute frame index.
+    """One camera's frames of the whole dataset, (N, H, W, C) uint8, by absolute frame index.
 
-    Episodes are decoded on first use, and each is marked when its frames are on disk: an interrupted decoding
-    goes on where it stopped, and a dataset opened for some episodes decodes only those.
+    Episodes are decoded on first use and each is marked once its frames are on disk, so that an interrupted decoding
+    resumes, and a dataset opened for some episodes decodes only those.
 
     Args:
         dataset: The dataset.
         key: The camera.
-        folder: Where its file lies; each size has one.
-        size: (H, W) that frames are resized to; None leaves them.
+        folder: Folder of the cache; it has one file per camera and size.
+        size: (H, W) that frames are resized to; None keeps their size.
     """
 
     def __init__(
@@ -97,14 +100,14 @@ class CameraCache:
 
     @property
     def frames(self) -> np.ndarray:
-        """The memory map, (N, H, W, C) uint8; only episodes that were asked for hold frames."""
+        """The memory map, (N, H, W, C) uint8; frames of episodes that were never decoded are zero."""
         return self._frames
 
     def ensure(self, episodes: Iterable[int]) -> None:
-        """Decode the episodes that are not in the cache yet, on up to 16 cores.
+        """Decode episodes that are not in the cache yet, on up to 16 cores.
 
         Raises:
-            OSError: Their frames do not fit on the disk.
+            OSError: The frames do not fit on the disk.
             DatasetError: A file is damaged.
         """
         missing = [episode for episode in episodes if not self._decoded[episode]]
@@ -116,13 +119,13 @@ class CameraCache:
             list(tqdm(done, total=len(missing), desc=f"Decoding {self._key}", unit="episode", leave=False))
 
     def _check_room(self, episodes: list[int]) -> None:
-        # A write through a memory map that finds the disk full does not raise: it kills the process.
+        # Writing to a memory map on a full disk raises no error but kills the process.
         lengths = self._dataset.meta.episodes["length"][:]
         needed = sum(lengths[episode] for episode in episodes) * self._frames[0].nbytes
         free = shutil.disk_usage(self._folder).free
         if needed > free:
             raise OSError(
-                f"The decoded frames of {self._key} take {needed / 1e9:.1f} GB, and {self._folder} has "
+                f"The decoded frames of {self._key} need {needed / 1e9:.1f} GB, but {self._folder} has "
                 f"{free / 1e9:.1f} GB free: make room there, or set {CACHE_VARIABLE} to a folder on a larger disk."
             )
 
@@ -133,21 +136,21 @@ class CameraCache:
         self._reserve(position, row["length"])
         try:
             for images in self._images(row):
-                for part in images.split(_RESIZED_AT_ONCE):
-                    if part.shape[-2:] != size:
-                        part = (resize_images(part.float() / 255, size) * 255).round().to(torch.uint8)
-                    self._frames[position : position + len(part)] = part.permute(0, 2, 3, 1).numpy()
-                    position += len(part)
-        except Exception as error:  # what decoders raise for damaged bytes is not documented
+                for chunk in images.split(_RESIZED_AT_ONCE):
+                    if chunk.shape[-2:] != size:
+                        chunk = (resize_images(chunk.float() / 255, size) * 255).round().to(torch.uint8)
+                    self._frames[position : position + len(chunk)] = chunk.permute(0, 2, 3, 1).numpy()
+                    position += len(chunk)
+        except Exception as error:  # decoders do not document what they raise for damaged files
             raise DatasetError(
                 f"{self._file(episode)}: the images of {self._key} in episode {episode} cannot be decoded "
-                f"({one_line(error)}): the file is damaged; {MEND}."
+                f"({brief(error)}): the file is damaged; {FIX}."
             ) from error
         self._frames.flush()
         self._decoded[episode] = 1
 
     def _reserve(self, position: int, length: int) -> None:
-        """Have the disk set aside the place of an episode: others may have filled it since there was room for all."""
+        """Reserve an episode's place on the disk, which others may have filled since the check for room."""
         if not hasattr(os, "posix_fallocate"):  # macOS
             return
         frame_bytes = self._frames[0].nbytes
@@ -156,7 +159,7 @@ class CameraCache:
             try:
                 os.posix_fallocate(file.fileno(), start, length * frame_bytes)
             except OSError as error:
-                error.filename = str(self._path)  # which the system does not know
+                error.filename = str(self._path)
                 raise
 
     def _file(self, episode: int) -> Path:
@@ -166,14 +169,14 @@ class CameraCache:
         return root / meta.get_data_file_path(episode)
 
     def _images(self, row: dict[str, Any]) -> Iterator[Tensor]:
-        """An episode's frames as they are stored, some at a time: (T, C, H, W) uint8."""
+        """An episode's stored frames in chunks, (T, C, H, W) uint8."""
         meta = self._dataset.meta
         start, stop = row["dataset_from_index"], row["dataset_to_index"]
         count = max(1, _CHUNK_BYTES // math.prod(frame_shape(meta.features[self._key])))
         if self._key in meta.video_keys:
             first = row[f"videos/{self._key}/from_timestamp"]
             for position in range(0, stop - start, count):
-                # Not by torchcodec, for which LeRobot keeps one decoder per file, and other threads read the same file.
+                # Not with torchcodec: LeRobot keeps one decoder per file, and several threads read the same file.
                 yield decode_video_frames(
                     self._file(row["episode_index"]),
                     [first + i / meta.fps for i in range(position, min(position + count, stop - start))],
@@ -183,7 +186,8 @@ class CameraCache:
                 )
             return
         relative = self._dataset.absolute_to_relative_idx
-        column = self._dataset.hf_dataset.select_columns(self._key)  # other cameras' images stay undecoded
+        # Images of other columns are not decoded.
+        column = self._dataset.hf_dataset.select_columns(self._key)
         for position in range(start, stop, count):
             first = position if relative is None else relative[position]
             rows = column[first : first + min(count, stop - position)][self._key]
@@ -191,80 +195,70 @@ class CameraCache:
 
     @staticmethod
     def _open(path: Path, shape: tuple[int, ...]) -> np.memmap:
-        if path.is_file():
-            return open_memmap(path, mode="r+")
-        partial = path.with_suffix(f".{os.getpid()}.tmp")
-        try:
-            open_memmap(partial, mode="w+", dtype=np.uint8, shape=shape).flush()
-            # A hard link, not a rename: where another process was faster its file stays, and both write into that one.
-            try:
-                os.link(partial, path)
-            except FileExistsError:
-                pass
-            except OSError:  # exFAT and some file systems of the network know no links
-                partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        if not path.is_file():
+            # Several processes may open the cache at once; all must write into the same file.
+            with sole_writer(path, wait=True):
+                if not path.is_file():
+                    with appears_whole(path) as temporary:
+                        open_memmap(temporary, mode="w+", dtype=np.uint8, shape=shape).flush()
         return open_memmap(path, mode="r+")
 
 
-def _tell_of_earlier_frames(folder: Path) -> None:
-    """Say that frames of other versions of the dataset lie beside: nobody else removes them."""
-    earlier = sorted(folder.parent.glob("frames-*"))
-    if earlier:
-        logger.warning(
-            "The dataset has changed: its frames are decoded anew. Remove those of earlier versions, %s, where no "
-            "training reads them any more.",
-            ", ".join(map(str, earlier)),
-        )
-
-
 def check_colours(dataset: LeRobotDataset, keys: Iterable[str]) -> None:
-    """Refuse cameras whose pixels are distances, and videos of anything but three colours, which is what is decoded.
+    """Check that cameras show colours, not depth, and that videos have three channels, as decoding assumes.
 
     Raises:
-        ValueError: Some of the keys are such cameras.
+        ValueError: A camera differs.
     """
     keys = list(keys)
     depth = [key for key in keys if key in dataset.meta.depth_keys]
     if depth:
         raise ValueError(
-            f"{dataset.repo_id} has depth cameras, {', '.join(depth)}; models here see colours, 0 to 255. Choose the "
-            "others with --policy.image_key, or remove these with lerobot-edit-dataset."
+            f"{dataset.repo_id} has depth cameras ({', '.join(depth)}), but models here see colours, 0 to 255. Choose "
+            "other cameras with --policy.image_key, or remove the depth cameras with lerobot-edit-dataset."
         )
     for key in set(keys) & set(dataset.meta.video_keys):
         channels = frame_shape(dataset.meta.features[key])[2]
         if channels != _VIDEO_CHANNELS:
             raise ValueError(
-                f"{dataset.repo_id} has videos of {channels} channels of {key}; models here take videos of "
-                f"{_VIDEO_CHANNELS}, red, green and blue. Choose the others with --policy.image_key, or record grey "
-                "frames with three channels that are equal."
+                f"{dataset.repo_id} has videos with {channels} channels of {key}, but models here take "
+                f"{_VIDEO_CHANNELS}: red, green and blue. Choose other cameras with --policy.image_key, or record grey "
+                "frames with three equal channels."
             )
 
 
 def frame_shape(feature: dict[str, Any]) -> tuple[int, int, int]:
-    """(H, W, C) of a camera's frames, from its entry in a dataset's `features`."""
+    """(H, W, C) of a camera's frames.
+
+    Args:
+        feature: The camera's entry in a dataset's `features`.
+    """
     shape = tuple(feature["shape"])
     return shape if feature["names"][2].startswith("channel") else (*shape[1:], shape[0])
 
 
 def camera_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int] | None = None) -> Tensor:
-    """A camera's decoded frames, (N, H, W, C) uint8 by absolute index, memory-mapped.
+    """A camera's decoded frames, memory-mapped: (N, H, W, C) uint8, by absolute frame index.
 
     Frames of episodes outside `dataset.episodes` are zero unless an earlier call decoded them.
 
     Args:
         dataset: The dataset.
         key: The camera.
-        size: (H, W) that frames are resized to, once; None leaves them as they are in the dataset.
+        size: (H, W) that frames are resized to when they are decoded; None keeps their size.
 
     Raises:
-        ValueError: It is a depth camera, or has videos that are not in three colours.
+        ValueError: It is a depth camera, or its videos do not have three channels.
     """
     check_colours(dataset, [key])
     folder = cache_root(Path(dataset.root)) / f"frames-{dataset_fingerprint(Path(dataset.root))}"
     if not folder.is_dir():
-        _tell_of_earlier_frames(folder)
+        if earlier := sorted(folder.parent.glob("frames-*")):
+            logger.warning(
+                "The dataset has changed: its frames are decoded again. Remove frames of earlier versions that no run "
+                "reads any more: %s.",
+                ", ".join(map(str, earlier)),
+            )
         folder.mkdir(exist_ok=True)
     cache = CameraCache(dataset, key, folder, size)
     cache.ensure(range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes)

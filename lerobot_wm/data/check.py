@@ -1,90 +1,258 @@
-"""Is a dataset on this machine whole? Asked before any work.
+"""Is a dataset on this machine complete and readable? Checked before any work.
 
-LeRobot would ask the Hub for what is missing, and find out late about the rest. Metadata is read, the columns that
-number the frames, and the headers of videos; no image is decoded.
+LeRobot asks the Hub for missing files, and notices damaged ones late. The metadata, the columns that number the frames
+and the headers of videos are read here; no image is decoded.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import json
+from collections.abc import Callable
 from pathlib import Path
 
-from datasets.exceptions import DatasetGenerationError
-from huggingface_hub.utils import validate_repo_id
+import av
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.io_utils import load_episodes, load_info, load_stats, load_tasks
+from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR, INFO_PATH, STATS_PATH
 
-from lerobot_wm.data.check_files import (
-    check_contents,
-    check_frames,
-    check_tasks,
-    check_video_file,
-    check_video_times,
-    read_episodes,
+from lerobot_wm.constants import ACTION, OBS_STATE
+
+FIX = "copy or download the dataset again"
+_RECOMPUTE = (
+    f"{FIX}, or train on a copy that `lerobot-edit-dataset --operation.type=recompute_stats` makes, with "
+    "--dataset.use_imagenet_stats=false if it has no statistics of images"
 )
-from lerobot_wm.data.check_meta import check_stats, read_info
-from lerobot_wm.data.source import DatasetError, dataset_folder, is_snapshot
+# Each part of the metadata, and how LeRobot reads it.
+_METADATA: dict[str, Callable[[Path], object]] = {
+    INFO_PATH: load_info,
+    STATS_PATH: load_stats,
+    DEFAULT_TASKS_PATH: load_tasks,
+    EPISODES_DIR: load_episodes,
+}
 
 
-def check_dataset(repo_id: str, root: str | Path | None = None, revision: str | None = None) -> None:
-    """Refuse a dataset on this machine that is not whole, or whose parts do not belong together.
+class DatasetError(ValueError):
+    """A dataset cannot be used; the message names the file, what is wrong with it and how to fix it."""
 
-    Nothing is looked up elsewhere. A dataset that is not here passes: LeRobot will download it.
 
-    Args:
-        repo_id: The dataset's name.
-        root: Its folder; None looks where LeRobot does.
-        revision: As in `LeRobotDataset`.
+def read_file[T](path: Path, read: Callable[[Path], T]) -> T:
+    """Read a file that may be missing or damaged.
 
     Raises:
-        DatasetError: Names the file, what is wrong with it, and how to mend it.
-        HFValidationError: The name is none of a repository and no folder is given.
+        DatasetError: The file is missing, or the reader fails.
     """
-    if root is None:
-        validate_repo_id(repo_id)
-    folder = dataset_folder(repo_id, root, revision)
-    if folder is not None:
-        with _removal_named(folder):
-            _check_folder(folder)
+    if not path.exists():
+        raise DatasetError(
+            f"{path} is missing: {FIX}. If its recording was interrupted before `finalize()`, record it again."
+        )
+    try:
+        return read(path)
+    except Exception as error:  # readers do not document what they raise for damaged files
+        raise DatasetError(
+            f"{path} cannot be read ({brief(error.__cause__ or error)}): it is incomplete or damaged; {FIX}."
+        ) from error
 
 
-def _check_folder(folder: Path) -> None:
-    info = read_info(folder)
-    check_stats(info)
-    check_tasks(info)
-    episodes = read_episodes(info)
-    # Of a dataset of the Hub some episodes may be here; LeRobot downloads the others when they are asked for.
-    partial = is_snapshot(folder) or (folder / ".cache" / "huggingface").is_dir()
-    check_frames(info, episodes, partial)
-    for camera in info.video_keys:
-        check_video_times(info, camera, episodes)
-        for path, seconds in info.videos(camera, episodes).items():
-            if path.exists() or not partial:
-                check_video_file(info, camera, path, seconds)
+def brief(error: object) -> str:
+    """The beginning of a library's message, on one line and without control characters."""
+    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    return " ".join(text.split())[:160]
 
 
-@contextmanager
-def damage_named(repo_id: str, root: str | Path | None, revision: str | None) -> Iterator[None]:
-    """Name the file where LeRobot finds a table damaged that `check_dataset` passed: it reads no values.
+def check_metadata_files(folder: Path) -> None:
+    """Check that the metadata is there, and of a version that LeRobot reads.
+
+    Raises:
+        DatasetError: A file is missing or damaged, or the dataset has another version.
+    """
+    path = folder / INFO_PATH
+    info = read_file(path, lambda path: json.loads(path.read_text(encoding="utf-8")))
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if not str(version).startswith("v3."):
+        raise DatasetError(
+            f"{path}: codebase_version is {str(version)[:80]!r}; expected v3.0. Convert the dataset with "
+            "`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=...`."
+        )
+    if not (folder / STATS_PATH).is_file():
+        raise DatasetError(
+            f"{folder / STATS_PATH} is missing, which scales actions and proprioception: {_RECOMPUTE}."
+        )
+    for name in _METADATA:
+        read_file(folder / name, lambda path: None)
+    if not list((folder / EPISODES_DIR).glob("*/*.parquet")):
+        raise DatasetError(f"{folder / EPISODES_DIR} has no tables of episodes: {FIX}, or record it again.")
+
+
+def name_damaged_metadata(folder: Path) -> None:
+    """Find the file that LeRobot could not read.
 
     Raises:
         DatasetError: Names the file.
     """
-    try:
-        yield
-    except DatasetGenerationError:
-        folder = dataset_folder(repo_id, root, revision)
-        if folder is not None:
-            with _removal_named(folder):
-                check_contents(folder)
-        raise
+    for name, load in _METADATA.items():
+
+        def read(path: Path, load: Callable[[Path], object] = load) -> object:
+            return load(folder)
+
+        read_file(folder / name, read)
 
 
-@contextmanager
-def _removal_named(folder: Path) -> Iterator[None]:
-    """Say how to have a dataset of the Hub downloaded again: what is in its cache LeRobot takes from there."""
-    try:
-        yield
-    except DatasetError as error:
-        if not is_snapshot(folder):
-            raise
+def name_damaged_table(folder: Path) -> None:
+    """Read all tables of frames, of which `check_dataset` reads only some columns.
+
+    Raises:
+        DatasetError: Names the first file that cannot be read.
+    """
+    for path in sorted((folder / "data").glob("*/*.parquet")):
+        read_file(path, lambda path: sum(len(rows) for rows in pq.ParquetFile(path).iter_batches()))
+
+
+def check_dataset(meta: LeRobotDatasetMetadata, *, partial: bool) -> None:
+    """Check that a dataset's files are whole and belong together.
+
+    Args:
+        meta: Its metadata.
+        partial: Whether files may be missing, because LeRobot downloads them when they are needed.
+
+    Raises:
+        DatasetError: Names the file, what is wrong with it and how to fix it.
+    """
+    _check_names(meta)
+    _check_stats(meta)
+    episodes = _read_episodes(meta)
+    _check_tables(meta, episodes, partial)
+    for camera in meta.video_keys:
+        _check_videos(meta, camera, episodes, partial)
+
+
+def _check_names(meta: LeRobotDatasetMetadata) -> None:
+    # Names of cameras become names of files in the cache.
+    if bad := [name for name in meta.features if "/" in name]:
+        raise DatasetError(f"{meta.root / INFO_PATH}: feature {bad[0]!r} has a slash in its name: rename it.")
+    path = meta.root / DEFAULT_TASKS_PATH
+    numbers = read_file(path, lambda _: list(meta.tasks["task_index"]))
+    # Task strings are looked up by their row.
+    if numbers != list(range(len(numbers))):
+        raise DatasetError(f"{path}: task_index is {str(numbers)[:80]}; expected 0, 1, 2 and so on: {FIX}.")
+
+
+def _check_stats(meta: LeRobotDatasetMetadata) -> None:
+    """Without statistics LeRobot would train, but not scale actions and proprioception."""
+    for feature in (name for name in (ACTION, OBS_STATE) if name in meta.features):
+        size = int(np.prod(meta.features[feature]["shape"]))
+        for name in ("min", "max", "mean", "std"):
+            try:
+                values = np.asarray(meta.stats[feature][name], dtype=np.float64)
+            except (LookupError, TypeError, ValueError):  # missing, or no numbers
+                values = np.empty(0)
+            if values.size != size or not np.isfinite(values).all():
+                raise DatasetError(
+                    f"{meta.root / STATS_PATH}: {name} of {feature} is {brief(values.tolist())}; expected {size} "
+                    f"finite numbers, which scale it: {_RECOMPUTE}."
+                )
+
+
+def _read_episodes(meta: LeRobotDatasetMetadata) -> pd.DataFrame:
+    """The place of each episode in the dataset and its files, checked to follow each other."""
+    folder = meta.root / EPISODES_DIR
+    columns = ["episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index"]
+    for camera in meta.video_keys:
+        columns += [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "to_timestamp")]
+    episodes = read_file(folder, lambda _: meta.episodes.select_columns(columns).to_pandas().astype(float))
+    stops = episodes["length"].cumsum()
+    wrong = (
+        (episodes["episode_index"] != np.arange(len(episodes)))
+        | ~(episodes["length"] >= 1)
+        | (episodes["dataset_from_index"] != stops - episodes["length"])
+    )
+    if wrong.any():
         raise DatasetError(
-            f"{error} What is in the Hub's cache is not downloaded again: remove {folder.parents[1]} first."
-        ) from error
+            f"{folder}: episode {wrong.argmax()} is empty, or does not follow the one before it: {FIX}."
+        )
+    found, expected = (len(episodes), int(stops.iloc[-1])), (meta.total_episodes, meta.total_frames)
+    if found != expected:
+        raise DatasetError(
+            f"{folder} has {found[0]} episodes with {found[1]} frames, {INFO_PATH} says {expected[0]} episodes with "
+            f"{expected[1]} frames: {FIX}. If its recording was interrupted before `finalize()`, record it again."
+        )
+    return episodes
+
+
+def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial: bool) -> None:
+    files = {
+        meta.root / meta.get_data_file_path(int(rows["episode_index"].iloc[0])): rows
+        for _, rows in episodes.groupby(["data/chunk_index", "data/file_index"])
+    }
+    unknown = sorted(set((meta.root / "data").glob("*/*.parquet")) - files.keys())
+    if unknown:
+        raise DatasetError(
+            f"{unknown[0]} belongs to no episode, but LeRobot would read it: remove the file, or {FIX}."
+        )
+    columns = ["index", "episode_index", "timestamp"]
+    for path, rows in files.items():
+        if partial and not path.exists():
+            continue
+        table = read_file(path, lambda path: pq.read_table(path).select(columns).to_pandas().astype(float))
+        lengths = rows["length"].astype(int)
+        if len(table) != lengths.sum():
+            raise DatasetError(
+                f"{path} has {len(table)} frames; its episodes in {EPISODES_DIR} have {lengths.sum()}: {FIX}."
+            )
+        frame = np.concatenate([np.arange(length) for length in lengths])
+        first = np.repeat(rows["dataset_from_index"].to_numpy(), lengths)
+        episode = np.repeat(rows["episode_index"].to_numpy(), lengths)
+        if (table["index"] != first + frame).any() or (table["episode_index"] != episode).any():
+            raise DatasetError(
+                f"{path}: frames are repeated, missing or out of order, or belong to other episodes: {FIX}."
+            )
+        if not (abs(table["timestamp"] * meta.fps - frame) < 0.5).all():
+            raise DatasetError(
+                f"{path}: the timestamps are not those of {meta.fps:g} frames per second, which is fps in {INFO_PATH}: "
+                f"set fps to the rate of the recording, or {FIX}."
+            )
+
+
+def _check_videos(meta: LeRobotDatasetMetadata, camera: str, episodes: pd.DataFrame, partial: bool) -> None:
+    prefix = f"videos/{camera}"
+    for _, rows in episodes.groupby([f"{prefix}/chunk_index", f"{prefix}/file_index"]):
+        path = meta.root / meta.get_video_file_path(int(rows["episode_index"].iloc[0]), camera)
+        if partial and not path.exists():
+            continue
+        if missing := read_file(path, _missing_bytes):
+            raise DatasetError(f"{path} lacks its last {missing} bytes: it is incomplete; {FIX}.")
+        frames = read_file(path, _video_frames)
+        needed = round(rows[f"{prefix}/to_timestamp"].max() * meta.fps)
+        if frames < needed:
+            raise DatasetError(f"{path} has {frames} frames; its episodes need {needed}: {FIX}.")
+
+
+def _video_frames(path: Path) -> int:
+    """Number of frames, as the file's header states it."""
+    with av.open(str(path)) as container:
+        frames = container.streams.video[0].frames
+    return frames
+
+
+def _missing_bytes(path: Path) -> int:
+    """How many bytes the last box of an MP4 file has beyond the end of the file; 0 for other formats.
+
+    FFmpeg opens an incomplete file if its header is there, and notices only when it decodes the missing frames.
+    """
+    size = path.stat().st_size
+    position = 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            header = file.read(16)
+            length = int.from_bytes(header[:4])
+            if position == 0 and header[4:8] != b"ftyp":
+                return 0
+            if length == 1:  # a box of more than 4 GB: its length follows
+                length = int.from_bytes(header[8:16])
+            if length == 0:  # to the end of the file
+                return 0
+            if length < 8:
+                raise ValueError("a box is shorter than its header")
+            position += length
+    return position - size

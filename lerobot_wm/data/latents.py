@@ -1,4 +1,4 @@
-"""The record a latent dataset carries: which world model and which dataset it was made from."""
+"""Fingerprints of weights and datasets, and the record of a latent dataset: what it was made from."""
 
 import hashlib
 import json
@@ -14,11 +14,11 @@ _HEX_DIGITS = 16
 
 
 def weights_fingerprint(module: nn.Module, settings: Mapping[str, Any] | None = None) -> str:
-    """Hash of every parameter and buffer: names, shapes, types and bytes. 16 hexadecimal digits.
+    """Hash of all parameters and buffers (names, shapes, types, bytes): 16 hexadecimal digits.
 
     Args:
         module: The module.
-        settings: What else decides what it computes.
+        settings: Settings that also decide what it computes.
     """
     digest = hashlib.sha256()
     for name, tensor in sorted(module.state_dict().items()):
@@ -30,7 +30,7 @@ def weights_fingerprint(module: nn.Module, settings: Mapping[str, Any] | None = 
 
 
 def dataset_fingerprint(root: Path) -> str:
-    """Hash of a LeRobotDataset's metadata, tables and videos: relative paths and bytes. 16 hexadecimal digits.
+    """Hash of a dataset's metadata, tables and videos (relative paths and bytes): 16 hexadecimal digits.
 
     Args:
         root: The dataset's folder, as in `LeRobotDataset.root`.
@@ -40,10 +40,10 @@ def dataset_fingerprint(root: Path) -> str:
     return _hash_files(root, tuple((path, stat.st_size, stat.st_mtime_ns) for path, stat in stats))
 
 
-# Each camera and each loader of a run asks, and reading tens of gigabytes takes minutes.
+# Each camera and loader of a run asks for it, and reading tens of gigabytes takes minutes.
 @lru_cache(maxsize=4)
 def _hash_files(root: Path, files: tuple[tuple[Path, int, int], ...]) -> str:
-    """Hash of the files of a folder: path, size and time of change of each."""
+    """Hash of files in a folder, each given as path, size and time of change."""
     digest = hashlib.sha256()
     for path, _, _ in files:
         digest.update(f"{path.relative_to(root).as_posix()}\n".encode())
@@ -57,16 +57,16 @@ RECORD_PATH = "meta/latents.json"
 
 @dataclass(frozen=True)
 class LatentRecord:
-    """Provenance of a latent dataset, kept in its `meta/latents.json`.
+    """What a latent dataset was made from, stored in its `meta/latents.json`.
 
     Attributes:
-        world_model_fingerprint: `encoder_fingerprint` of the encoding world model.
-        source_repo_id: The dataset that was encoded.
-        source_fingerprint: `dataset_fingerprint` of it.
-        tasks: Its task strings, in order of task_index.
-        sampled: False where z_t is the posterior mean, True where it is a sample.
-        camera_shapes: (C, H, W) of the cameras that were encoded, as they are in that dataset; none in older records.
-        sample_seed: Seed of the samples; None where there are none, and in older records.
+        world_model_fingerprint: `encoder_fingerprint` of the world model.
+        source_repo_id: The image dataset.
+        source_fingerprint: `dataset_fingerprint` of the image dataset.
+        tasks: Task strings in order of task_index.
+        sampled: Whether z_t is a sample of the posterior rather than its mean.
+        camera_shapes: (C, H, W) in the image dataset of each camera that was encoded.
+        sample_seed: Seed of the samples; None if there are none.
     """
 
     world_model_fingerprint: str
@@ -79,17 +79,14 @@ class LatentRecord:
 
     @property
     def made_of(self) -> dict[str, str]:
-        """What the latents depend on, as far as the record tells."""
-        made_of = {
+        """All that the latents depend on."""
+        return {
             "world_model_fingerprint": self.world_model_fingerprint,
             "source_fingerprint": self.source_fingerprint,
             "sampled": str(self.sampled),
+            "sample_seed": str(self.sample_seed),
+            "cameras": ", ".join(self.camera_shapes),
         }
-        if self.sample_seed is not None:
-            made_of["sample_seed"] = str(self.sample_seed)
-        if self.camera_shapes:
-            made_of["cameras"] = ", ".join(self.camera_shapes)
-        return made_of
 
     def write(self, root: Path) -> None:
         """Write the record into the dataset at `root`."""
@@ -100,43 +97,43 @@ class LatentRecord:
         """Read the record of the dataset at `root`.
 
         Raises:
-            ValueError: The dataset carries none, or one that is damaged.
+            ValueError: The record is missing or damaged.
         """
         path = root / RECORD_PATH
         if not path.is_file():
             raise ValueError(
-                f"{path} is missing, so nothing tells which world model these latents are of: "
-                "encode the dataset again with `lerobot-wm encode`."
+                f"{path} is missing, which names the world model of these latents: encode the dataset again with "
+                "`lerobot-wm encode`."
             )
         try:
             return cls(**json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, TypeError) as error:
             raise ValueError(
-                f"{path} is no record of latents ({error}): it was cut short or damaged; copy the dataset again, "
-                "whole, or encode it again with `lerobot-wm encode`."
+                f"{path} is not a record of latents ({error}): it is incomplete or damaged; copy the dataset again, or "
+                "encode it again with `lerobot-wm encode`."
             ) from error
 
     def check_world_model(self, fingerprint: str | None, path: str | None) -> None:
-        """Refuse latents of another world model.
+        """Check that the latents are of this world model.
 
         Raises:
             ValueError: The fingerprints differ.
         """
         if self.world_model_fingerprint != fingerprint:
             raise ValueError(
-                f"These latents were encoded by world model {self.world_model_fingerprint}, but {path} is world model "
-                f"{fingerprint}. A policy would act on states it was never trained on: encode {self.source_repo_id} "
-                "with this world model, or pass the world model the latents are of."
+                f"These latents are of world model {self.world_model_fingerprint}, but {path} is world model "
+                f"{fingerprint}: the policy would see different states when it acts. Encode {self.source_repo_id} with "
+                "this world model, or give the world model of the latents."
             )
 
     def check_cameras(self, cameras: list[str], path: str | None) -> None:
-        """Refuse latents of other cameras' images; older records do not tell whose they are.
+        """Check that the latents are of these cameras.
 
         Raises:
             ValueError: The cameras differ.
         """
         if self.camera_shapes and list(self.camera_shapes) != cameras:
             raise ValueError(
-                f"These latents are of the images of {', '.join(self.camera_shapes)}, but {path} sees "
+                f"These latents are of the cameras {', '.join(self.camera_shapes)}, but {path} sees "
                 f"{', '.join(cameras)}: encode {self.source_repo_id} with this world model."
             )

@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Subset
 
 from lerobot_wm.data.cache import camera_frames, check_colours
-from lerobot_wm.data.check_meta import TEXT_DTYPES
-from lerobot_wm.data.tables import check_finite_columns, column_tensor
+from lerobot_wm.data.tables import TEXT_DTYPES, check_finite_columns, column_tensor
 
 
 class EpochOrder:

@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lerobot_wm.constants import (
     ACTION,
     ACTION_DIM,
@@ -25,20 +23,21 @@ from lerobot_wm.constants import (
     VARIATION,
 )
 
-COLLECTION_RECORD = Path("meta", "collection.json")  # how `lerobot-wm collect` made the dataset
-RELABEL_RECORD = Path("meta", "relabel.json")  # which column `lerobot-wm relabel` made the reward
+# How `lerobot-wm collect` made the dataset, and which column `lerobot-wm relabel` made its reward.
+COLLECTION_RECORD = Path("meta", "collection.json")
+RELABEL_RECORD = Path("meta", "relabel.json")
 STATE_NAMES = ["x", "y", "z", "gripper"]
 
 
 def metaworld_features(image_size: int, image_keys: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """LeRobot's description of each feature: dtype, shape and names.
+    """The dtype, shape and names of each feature, as LeRobot describes them.
 
-    `next.reward` is the sparse reward, 1 where the step ends in success; `next.dense_reward` is Meta-World's
-    shaped one; `next.done` is True from the first success on.
+    `next.reward` is the sparse reward, 1 where a step ends in success; `next.dense_reward` is Meta-World's shaped
+    reward; `next.done` is True from the first success on.
 
     Args:
         image_size: Height and width of every camera's images in pixels.
-        image_keys: The cameras' feature keys.
+        image_keys: Feature keys of the cameras.
     """
     shape = (image_size, image_size, 3)
     return {
@@ -56,19 +55,3 @@ def metaworld_features(image_size: int, image_keys: Iterable[str]) -> dict[str, 
         TASK_ID: {"dtype": "int16", "shape": (1,), "names": None},
         VARIATION: {"dtype": "int16", "shape": (1,), "names": None},
     }
-
-
-def check_finite(arrays: dict[str, np.ndarray], where: str) -> None:
-    """Refuse an episode with NaN or infinite values; LeRobot would write them silently.
-
-    Args:
-        arrays: feature name -> values of shape (T, ...).
-        where: the episode's name for the message.
-
-    Raises:
-        ValueError: naming the feature and the first frame concerned.
-    """
-    for name, values in arrays.items():
-        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        if bad.any():
-            raise ValueError(f"{where}, frame {int(bad.argmax())}: {name} is not finite; episode refused.")

@@ -13,16 +13,18 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION
-from lerobot_wm.data.source import DatasetError
+from lerobot_wm.data.check import DatasetError
+
+TEXT_DTYPES = ("string", "language")
 
 
 def column_tensor(dataset: Dataset, key: str, shape: tuple[int, ...]) -> Tensor:
-    """One numeric column as LeRobot's loader would return it, for all rows.
+    """All rows of a numeric column, with the type and shape that LeRobot's loader returns.
 
     Args:
         dataset: `LeRobotDataset.hf_dataset`.
         key: The column.
-        shape: The feature's shape; (1,) is stored, and returned, without an axis.
+        shape: The feature's shape; a column of shape (1,) is stored and returned without that axis.
 
     Returns:
         (N, *shape): float32 for any float, int64 for any integer, bool for booleans.
@@ -30,7 +32,7 @@ def column_tensor(dataset: Dataset, key: str, shape: tuple[int, ...]) -> Tensor:
     column = dataset.data.table.column(key)
     if dataset._indices is not None:
         column = column.take(dataset._indices.column(0))
-    # Arrow maps the table from its file: joining the chunks is the one copy of a float32 or int64 column.
+    # Arrow memory-maps the table: a float32 or int64 column is copied only here, when its chunks are joined.
     values = np.concatenate([_flat_values(chunk) for chunk in column.chunks])  # (N * prod(shape),)
     if values.dtype != bool:
         values = values.astype(
@@ -41,24 +43,24 @@ def column_tensor(dataset: Dataset, key: str, shape: tuple[int, ...]) -> Tensor:
 
 
 def frame_numbers(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
-    """A column of one number per frame, read from the dataset's files.
+    """Read a column with one number per frame from a dataset's files.
 
     Args:
-        meta: The dataset's; its tables are on this machine.
+        meta: The dataset's metadata; its tables are on this machine.
         key: The column.
 
     Returns:
         (N,) float32 by absolute frame index; zero for episodes that were not downloaded.
 
     Raises:
-        FileNotFoundError: None of its tables is here.
+        FileNotFoundError: No table is on this machine.
     """
     numbers = torch.zeros(meta.total_frames)
     paths = sorted((Path(meta.root) / "data").rglob("*.parquet"))
     if not paths:
         raise FileNotFoundError(
-            f"{Path(meta.root) / 'data'} has no tables, and {key} is read from them: train without "
-            f"--dataset.streaming=true, or download {meta.repo_id} to that folder first."
+            f"{Path(meta.root) / 'data'} has no tables to read {key} from: train without --dataset.streaming=true, or "
+            f"download {meta.repo_id} to that folder first."
         )
     for path in paths:
         table = pq.read_table(path, columns=["index", key])
@@ -70,7 +72,7 @@ def frame_numbers(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
 
 
 def _flat_values(array: pa.Array) -> np.ndarray:
-    """The numbers of a column's chunk in order, without the lists they are stored in."""
+    """The numbers in one chunk of a column, without the lists they are stored in."""
     if isinstance(array, pa.ExtensionArray):
         array = array.storage
     while pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type):
@@ -78,17 +80,20 @@ def _flat_values(array: pa.Array) -> np.ndarray:
     return array.to_numpy(zero_copy_only=False)
 
 
-_READ = (ACTION, "observation.", "next.")  # beginnings of the names of all that is learned from
+# Prefixes of the features that policies learn from.
+_LEARNED = (ACTION, "observation.", "next.")
 
 
 def check_finite_dataset(dataset: LeRobotDataset) -> None:
-    """Refuse a dataset with a number that is not finite among its observations, actions and rewards.
+    """Check that all observations, actions and rewards of a dataset are finite.
 
     Raises:
         DatasetError: See `check_finite_columns`.
     """
     features = dataset.meta.features
-    wanted = [key for key in features if key.startswith(_READ) and features[key]["dtype"].startswith("float")]
+    wanted = [
+        key for key in features if key.startswith(_LEARNED) and features[key]["dtype"].startswith("float")
+    ]
     columns = {
         key: column_tensor(dataset.hf_dataset, key, tuple(features[key]["shape"]))
         for key in (*wanted, "task_index", "episode_index", "frame_index")
@@ -97,28 +102,27 @@ def check_finite_dataset(dataset: LeRobotDataset) -> None:
 
 
 def check_finite_columns(columns: Mapping[str, Tensor], tasks: Sequence[str], repo_id: str) -> None:
-    """Refuse observations, actions and rewards with a number that is not finite.
+    """Check that observations, actions and rewards are finite.
 
     Args:
-        columns: (N, ...) each, `task_index`, `episode_index` and `frame_index` (N,) among them.
-        tasks: Task strings by task_index.
+        columns: Tensors (N, ...), including `task_index`, `episode_index` and `frame_index` (N,).
+        tasks: Task strings, by task_index.
         repo_id: The dataset's name, for the message.
 
     Raises:
-        DatasetError: Naming the column, the task, the episode and the frame.
+        DatasetError: Names the column, task, episode and frame.
     """
     for key, values in columns.items():
-        if not key.startswith(_READ) or not values.is_floating_point():
+        if not key.startswith(_LEARNED) or not values.is_floating_point():
             continue
-        finite = values.isfinite().flatten(1).all(1) if values.ndim > 1 else values.isfinite()  # (N,)
-        if finite.all():
+        is_finite = values.isfinite().flatten(1).all(1) if values.ndim > 1 else values.isfinite()  # (N,)
+        if is_finite.all():
             continue
-        row = int(finite.int().argmin())
+        row = int(is_finite.int().argmin())
         task, episode, frame = (
             int(columns[name][row]) for name in ("task_index", "episode_index", "frame_index")
         )
         raise DatasetError(
-            f"{repo_id}: {key} holds NaN or Inf in episode {episode} (task {tasks[task]!r}), frame {frame}: nothing "
-            "can be learned from it. Remove the episode with lerobot-edit-dataset, or record it again; or remove the "
-            "feature there, if no policy is to read it."
+            f"{repo_id}: {key} is NaN or Inf in episode {episode} (task {tasks[task]!r}), frame {frame}. Use "
+            "lerobot-edit-dataset to remove the episode, or the feature if no policy needs it."
         )

@@ -1,16 +1,16 @@
-"""The cameras of Meta-World's models, and the names their images go by."""
+"""The cameras of Meta-World's models, and the feature keys of their images."""
 
 import difflib
 
 from lerobot_wm.constants import OBS_IMAGE, OBS_IMAGES
 
-# Two cameras that Meta-World's models lack. They move with the hand and never turn, as if mounted on the wrist: what
-# lies at one offset from the hand is always at one place of the image. Camera -> azimuth, elevation (degrees) and
-# distance (m).
+# Two cameras that Meta-World's models lack. They move with the hand but never turn, so that an offset from the
+# hand is always at the same place of the image. Camera -> azimuth, elevation (degrees) and distance (m).
 HAND_CAMERAS = {"hand_top": (90.0, -89.9, 0.8), "hand_side": (180.0, -15.0, 0.8)}
-HAND_VIEW_CENTER = (0.0, 0.15, -0.05)  # metres from the hand: ahead of it, where its work is
+# Metres from the hand: ahead of it, where it works.
+HAND_VIEW_CENTER = (0.0, 0.15, -0.05)
 CAMERAS = ("corner2", "corner", "corner3", "topview", "behindGripper", "gripperPOV", *HAND_CAMERAS)
-# Mounted with their upper side down; what is drawn with them is turned by 180 degrees.
+# Mounted upside down; their images are turned by 180 degrees.
 UPSIDE_DOWN = frozenset({"corner", "corner2", "corner3"})
 
 
@@ -18,7 +18,7 @@ def parse_cameras(spec: str) -> tuple[str, ...]:
     """Turn "corner2,topview" into ("corner2", "topview").
 
     Raises:
-        ValueError: No camera, an unknown or a repeated one.
+        ValueError: A camera is unknown or repeated, or there is none.
     """
     cameras = tuple(name.strip() for name in spec.split(","))
     for camera in cameras:
@@ -35,9 +35,9 @@ def parse_cameras(spec: str) -> tuple[str, ...]:
 
 
 def image_features(cameras: tuple[str, ...]) -> dict[str, str]:
-    """Camera -> feature key: `observation.image` of a single camera, `observation.images.<camera>` of several.
+    """The feature key of each camera: `observation.image` for one camera, `observation.images.<camera>` for several.
 
-    These are the keys that LeRobot gives to `pixels` of an environment, an image or a dictionary of images.
+    LeRobot gives the same keys to an environment's `pixels`, which are an image or a dictionary of images.
     """
     if len(cameras) == 1:
         return {cameras[0]: OBS_IMAGE}

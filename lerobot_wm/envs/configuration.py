@@ -1,4 +1,4 @@
-"""LeRobot's view of the environment: `--env.type=metaworld_mt`."""
+"""The environment type `--env.type=metaworld_mt`."""
 
 import logging
 import multiprocessing
@@ -34,17 +34,17 @@ class MetaworldMTEnvConfig(EnvConfig):
     """Meta-World tasks, each with 50 fixed variations; `reset(seed=k)` is variation k of the split.
 
     Args:
-        task: a task, a set (mt6, mt10, mt50) or a comma-separated list.
+        task: A task, a set (mt6, mt10, mt50) or a comma-separated list.
         split: "all" (variations 0-49), "seen" (0-9) or "unseen" (10-49).
-        variation_set: 42, on which results are reported, 43, other positions for choosing settings and for probes, or
-            44, others again for confirming a final choice.
-        environment_state: add the full state, `observation.environment_state` (39,), to the observation.
-        image_size: height and width of the image in pixels.
-        camera_name: one of the model's cameras, or several separated by commas: corner2,topview.
-        fast_rendering: leave out shadows, reflections, multisampling and details of the robot a fifth of a pixel
-            small.
-        episode_length: steps until truncation, at most 500.
-        obs_type: "pixels_agent_pos", the only kind.
+        variation_set: 42 for reported results, 43 for choosing settings and for probes, or 44 for confirming a final
+            choice.
+        environment_state: Add the full state, `observation.environment_state` (39,), to the observation.
+        image_size: Height and width of the image in pixels.
+        camera_name: A camera of the simulator, or several separated by commas: corner2,topview.
+        fast_rendering: Render without shadows, reflections, multisampling and details of the robot that are smaller
+            than a fifth of a pixel.
+        episode_length: Steps until truncation, at most 500.
+        obs_type: "pixels_agent_pos", the only supported type.
     """
 
     task: str = "mt6"
@@ -66,19 +66,19 @@ class MetaworldMTEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=lambda: {"action": ACTION, "agent_pos": OBS_STATE})
 
     def __post_init__(self) -> None:
-        """Check every field and state the images' shapes (height, width, channels)."""
+        """Check the fields and add the features of the cameras."""
         resolve_tasks(self.task)
         split_variations(self.split, self.variation_set)
         if self.obs_type != "pixels_agent_pos":
-            raise ValueError(f"obs_type is '{self.obs_type}'; this environment has only 'pixels_agent_pos'.")
+            raise ValueError(f"obs_type is '{self.obs_type}'; expected 'pixels_agent_pos'.")
         if self.image_size < 16:
             raise ValueError(f"image_size is {self.image_size}; expected at least 16 pixels.")
         if not 1 <= self.episode_length <= MAX_EPISODE_STEPS:
             raise ValueError(f"episode_length is {self.episode_length}; expected 1 to {MAX_EPISODE_STEPS}.")
         if self.max_parallel_tasks > 1:
             raise ValueError(
-                f"max_parallel_tasks is {self.max_parallel_tasks}: LeRobot would have one policy act in several tasks "
-                "by turns, which mixes up what it remembers of them. Use 1, or lerobot-wm eval --num_workers."
+                f"max_parallel_tasks is {self.max_parallel_tasks}: LeRobot would let one policy act in several tasks "
+                "in turns, which mixes up its recurrent states. Use 1, or `lerobot-wm eval --num_workers`."
             )
         shape = (self.image_size, self.image_size, 3)
         keys = image_features(parse_cameras(self.camera_name))
@@ -92,7 +92,7 @@ class MetaworldMTEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `MetaworldMTEnv` besides its task."""
+        """Arguments of `MetaworldMTEnv` except its task."""
         return {
             "split": self.split,
             "variation_set": self.variation_set,
@@ -106,9 +106,9 @@ class MetaworldMTEnvConfig(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """{task name: {0: vector environment of n_envs}}: LeRobot then reports success per task.
+        """Make {task name: {0: vector environment}}, for which LeRobot reports success per task.
 
-        A sub-environment whose episode is over is neither simulated nor drawn again until the next rollout.
+        A sub-environment whose episode has ended is neither simulated nor rendered until the next rollout.
         """
         from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
@@ -132,7 +132,7 @@ class MetaworldMTEnvConfig(EnvConfig):
 
     @staticmethod
     def _prepare_workers(n_envs: int) -> None:
-        # Workers are forked from a server that has imported torch and mujoco once, not once per worker.
+        # Workers are forked from a server that imports torch and mujoco once instead of once per worker.
         multiprocessing.get_context("forkserver").set_forkserver_preload(
             ["__main__", "lerobot.envs.utils", "metaworld", "lerobot_wm.envs.metaworld_mt"]
         )

@@ -29,26 +29,27 @@ Observation = dict[str, Any]
 class MetaworldMTEnv(gym.Env):
     """One Meta-World v3 task; `reset(seed=k)` restores fixed variation k of its split, bit for bit.
 
-    Observation: `pixels` uint8 (image_size, image_size, 3) RGB, with several cameras a dictionary of such
-    images by camera, and `agent_pos` float32 (4,): the end effector's position (m) and the gripper's opening
-    (0 to 1); with `environment_state` also `environment_state` float32 (39,), the property of that name. Action:
-    float32 (4,) in [-1, 1], moving the end effector by up to 1 cm per axis, and the gripper's effort. Reward: 1
-    on a step that ends in success, else 0. `info` holds `is_success`, `variation` and, after a step, `dense_reward`
-    (Meta-World's shaped reward, 0 to 10). The simulator is built at the first reset, so that many environments
-    can be made cheaply.
+    - Observation: `pixels`, uint8 RGB (image_size, image_size, 3), or a dictionary of images for several cameras;
+      `agent_pos`, float32 (4,): the end effector's position (m) and the gripper's opening (0 to 1); optionally
+      `environment_state`, float32 (39,).
+    - Action: float32 (4,) in [-1, 1]: the end effector's movement, up to 1 cm per axis, and the gripper's effort.
+    - Reward: 1 on a step that ends in success, else 0.
+    - `info`: `is_success`, `variation` and, after a step, `dense_reward` (Meta-World's shaped reward, 0 to 10).
+
+    The simulator is built at the first reset, so that creating many environments is fast.
 
     Args:
-        task: a Meta-World v3 task, such as "reach-v3".
+        task: A Meta-World v3 task, such as "reach-v3".
         split: "all", "seen" (variations 0-9) or "unseen" (10-49).
-        variation_set: 42, on which results are reported, 43, for choosing settings and for probes, or 44, for
-            confirming a final choice.
-        environment_state: add the full state to the observation, for policies that are given the truth.
-        image_size: height and width of the image in pixels.
-        camera_name: one of the model's cameras, or several separated by commas; "corner2" is moved to where
-            every task is in view.
-        fast_rendering: leave out shadows, reflections, multisampling and details of the robot a fifth of a pixel
-            small.
-        episode_length: steps until truncation, at most 500.
+        variation_set: 42 for reported results, 43 for choosing settings and for probes, or 44 for confirming a final
+            choice.
+        environment_state: Add the full state to the observation.
+        image_size: Height and width of the image in pixels.
+        camera_name: A camera of the simulator, or several separated by commas; "corner2" is moved so that every task is
+            in view.
+        fast_rendering: Render without shadows, reflections, multisampling and details of the robot that are smaller
+            than a fifth of a pixel.
+        episode_length: Steps until truncation, at most 500.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (gymnasium's interface)
@@ -67,7 +68,8 @@ class MetaworldMTEnv(gym.Env):
     ) -> None:
         self.task = task
         self.task_description = task_description(task)
-        self._max_episode_steps = episode_length  # the name LeRobot's rollout reads
+        # LeRobot's rollout reads this name.
+        self._max_episode_steps = episode_length
         self._variations = split_variations(split, variation_set)
         self._variation_set = variation_set
         self._environment_state = environment_state
@@ -99,13 +101,13 @@ class MetaworldMTEnv(gym.Env):
 
     @property
     def environment_state(self) -> np.ndarray:
-        """Meta-World's full state, float64 (39,): hand and objects now, one step ago, and the goal."""
+        """Meta-World's full state, float64 (39,): hand and objects now and one step ago, and the goal."""
         return self._state.copy()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start a variation: number `seed` of the split, modulo their number; without a seed the next one."""
+        """Start variation `seed` of the split, modulo their number; without a seed, the next one."""
         super().reset(seed=seed)
         if self._sim is None:
             self._build()
@@ -121,33 +123,33 @@ class MetaworldMTEnv(gym.Env):
         """Execute one action for 0.0125 s.
 
         Raises:
-            ValueError: if the action has another shape or a value that is not finite.
+            ValueError: The action has another shape, or is not finite.
         """
         action = np.asarray(action, dtype=np.float32)
         if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
             raise ValueError(
-                f"{self.task}, variation {self.variation}, step {self._steps}: expected an action of "
-                f"{ACTION_DIM} finite numbers, found {action.tolist()}."
+                f"{self.task}, variation {self.variation}, step {self._steps}: the action is {action.tolist()}; "
+                f"expected {ACTION_DIM} finite numbers."
             )
         if self._sim is None:
             raise RuntimeError(f"{self.task}: call reset() before step().")
-        outcome = self._sim.step(np.clip(action, -1.0, 1.0))
+        result = self._sim.step(np.clip(action, -1.0, 1.0))
         self._steps += 1
-        self._state = outcome.state
+        self._state = result.state
         info = {
-            "is_success": outcome.success,
+            "is_success": result.success,
             "variation": self.variation,
-            "dense_reward": outcome.dense_reward,
+            "dense_reward": result.dense_reward,
         }
         truncated = self._steps >= self._max_episode_steps
-        return self._observe(), float(outcome.success), outcome.success, truncated, info
+        return self._observe(), float(result.success), result.success, truncated, info
 
     def render(self) -> np.ndarray:
-        """The current observation's images side by side, uint8 (image_size, cameras x image_size, 3)."""
+        """Images of the current observation side by side, uint8 (image_size, cameras x image_size, 3)."""
         return np.hstack(list(self._images.values()))
 
     def close(self) -> None:
-        """Free the simulator and its OpenGL memory; a later reset builds them again."""
+        """Free the simulator and its OpenGL memory; the next reset builds them again."""
         if self._sim is not None:
             for key in self._render_keys.values():
                 Renderer.release(key)

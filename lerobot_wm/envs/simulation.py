@@ -11,11 +11,12 @@ from metaworld.types import Task
 from lerobot_wm.constants import CAMERA_NAME, CAMERA_POSITION, REPORTED_VARIATION_SET
 from lerobot_wm.envs.variations import rand_vec
 
-SAVED_STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # everything mj_step reads
+# All that mj_step reads.
+SAVED_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-class Outcome(NamedTuple):
-    """What a step led to: state float64 (39,), Meta-World's shaped reward (0 to 10), and success."""
+class StepResult(NamedTuple):
+    """The result of a step: state float64 (39,), Meta-World's shaped reward (0 to 10), and success."""
 
     state: np.ndarray
     dense_reward: float
@@ -29,7 +30,7 @@ class Simulation:
     then the goal (3).
 
     Args:
-        task: a Meta-World v3 task, such as "reach-v3".
+        task: A Meta-World v3 task, such as "reach-v3".
         variation_set: 42, 43 or 44, see envs/variations.py.
     """
 
@@ -42,7 +43,7 @@ class Simulation:
         self.model.camera(CAMERA_NAME).pos[:] = CAMERA_POSITION
 
     def reset(self, variation: int) -> np.ndarray:
-        """Put hand, objects and goal where a variation has them, whatever ran before; returns the state."""
+        """Place hand, objects and goal as in a variation, independent of what ran before; returns the state."""
         data = {
             "rand_vec": rand_vec(self.task, variation, self.variation_set),
             "env_cls": type(self._env),
@@ -51,26 +52,27 @@ class Simulation:
         mujoco.mj_resetData(self.model, self.data)
         self._env.set_task(Task(env_name=self.task, data=pickle.dumps(data)))
         self._env.reset()
-        # Meta-World moves objects in the model but does not recompute positions: without this the first
-        # observation and image show them where the last episode had them.
+        # Meta-World moves objects in the model but does not recompute positions: without this, the first observation
+        # and image would show them where they were in the previous episode.
         mujoco.mj_forward(self.model, self.data)
         state = self._env._get_obs()
-        state[18:36] = state[:18]  # there is no earlier step
+        # There is no previous step.
+        state[18:36] = state[:18]
         self._env._prev_obs = state[:18].copy()
         return state
 
-    def step(self, action: np.ndarray) -> Outcome:
+    def step(self, action: np.ndarray) -> StepResult:
         """Advance by 0.0125 s with an action (4,) in [-1, 1]."""
         state, dense_reward, _, _, info = self._env.step(action)
-        return Outcome(state, float(dense_reward), bool(info["success"]))
+        return StepResult(state, float(dense_reward), bool(info["success"]))
 
     def save(self) -> np.ndarray:
-        """The physics state, for `restore` within the same variation."""
+        """The physics state, to `restore` within the same variation."""
         saved = np.empty(mujoco.mj_stateSize(self.model, SAVED_STATE))
         mujoco.mj_getState(self.model, self.data, saved, SAVED_STATE)
         return saved
 
     def restore(self, saved: np.ndarray) -> None:
-        """Return to a saved physics state, ready to be drawn."""
+        """Return to a saved physics state, ready to be rendered."""
         mujoco.mj_setState(self.model, self.data, saved, SAVED_STATE)
         mujoco.mj_forward(self.model, self.data)

@@ -18,7 +18,7 @@ class _TaskTables(TypedDict):
 
 @functools.cache
 def _tables() -> _TaskTables:
-    # Read as data: importing lerobot.envs.metaworld would import mujoco and every expert.
+    # Read as a file, because importing lerobot.envs.metaworld would import mujoco and all experts.
     return json.loads(resources.files("lerobot").joinpath("envs", "metaworld_config.json").read_text())
 
 
@@ -33,13 +33,13 @@ def resolve_tasks(spec: str) -> tuple[str, ...]:
     """Turn a task argument into task names.
 
     Args:
-        spec: a task (`reach-v3`), a set (`mt6`, `mt10`, `mt50`) or a comma-separated list of either.
+        spec: A task (`reach-v3`), a set (`mt6`, `mt10`, `mt50`) or a comma-separated list of either.
 
     Returns:
-        Task names in the order given, each once.
+        Task names in the given order, each once.
 
     Raises:
-        ValueError: for an empty argument or an unknown name, with the closest names that exist.
+        ValueError: The argument is empty, or a name is unknown; suggests the closest names.
     """
     task_sets = {**TASK_SETS, "mt50": all_tasks()}
     names = [name.strip() for name in spec.split(",") if name.strip()]
@@ -56,17 +56,17 @@ def resolve_tasks(spec: str) -> tuple[str, ...]:
 
 
 def task_description(task: str) -> str:
-    """The sentence LeRobot gives a task; push-v3 and push-back-v3 share theirs, all others are distinct."""
+    """LeRobot's description of a task; push-v3 and push-back-v3 share theirs, all others differ."""
     return _tables()["TASK_DESCRIPTIONS"][task]
 
 
 def task_id(task: str) -> int:
-    """LeRobot's number of a task, 0 to 49."""
+    """LeRobot's index of a task, 0 to 49."""
     return _tables()["TASK_NAME_TO_ID"][task]
 
 
 def expert_name(task: str) -> str:
-    """Name of the class in `metaworld.policies` that solves a task by script."""
+    """Name of the class in `metaworld.policies` with the scripted expert of a task."""
     return _tables()["TASK_POLICY_MAPPING"][task]
 
 

@@ -1,7 +1,7 @@
-"""`lerobot-wm eval`: lerobot-eval with its flags, one record per rollout.
+"""`lerobot-wm eval`: `lerobot-eval` with its flags, and a record of each rollout.
 
-What is added to LeRobot's own rollouts: each seed runs exactly once whatever the batch size, tasks can be
-spread over processes, and every rollout leaves a line in a records file.
+Unlike there, each seed runs exactly once for any batch size, tasks can be spread over processes, and a records file has
+one line per rollout.
 """
 
 import json
@@ -22,9 +22,9 @@ from lerobot_wm.constants import EVAL_INFO_NAME
 from lerobot_wm.evaluate.config import EvaluateConfig
 from lerobot_wm.evaluate.rollouts import TaskRunner, task_names
 from lerobot_wm.evaluate.wandb_log import log_evaluation, wandb_run
+from lerobot_wm.files import appears_whole
 from lerobot_wm.policies.common.checkpoint import open_checkpoint
 from lerobot_wm.policies.common.config import PolicyConfig
-from lerobot_wm.quiet import drop_remarks
 from lerobot_wm.records import (
     Record,
     is_in_split,
@@ -33,17 +33,17 @@ from lerobot_wm.records import (
     record_line,
     summarize_success,
 )
-from lerobot_wm.system import usable_cores
+from lerobot_wm.system import hide_harmless_messages, usable_cores
 from lerobot_wm.tables import table_by_split, terminal_tables
 from lerobot_wm.workers import map_in_workers
 
-# One policy per worker process, loaded once by `_start_worker`.
+# In a worker process: rolls out one task, with the policy that `_start_worker` loaded.
 _worker_run: Callable[[str], list[Record]]
 
 
 def _start_worker(cfg: EvaluateConfig, threads: int) -> None:
     global _worker_run
-    drop_remarks()
+    hide_harmless_messages()
     torch.set_num_threads(threads)
     _worker_run = TaskRunner(cfg).run
 
@@ -53,13 +53,13 @@ def _run_in_worker(task: str) -> list[Record]:
 
 
 def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
-    """Records task by task, in the order of `tasks`; a single process has its policy when this returns."""
+    """Records task by task, in the order of `tasks`; with one process, the policy is loaded when this returns."""
     if cfg.num_workers == 1:
         return map(TaskRunner(cfg).run, tasks)
     workers = min(cfg.num_workers, len(tasks))
     threads = max(1, usable_cores() // workers)
-    # LeRobot's progress bars of several processes would overwrite each other, and the parent's. tqdm reads this when a
-    # worker imports it: no bar is shown before so many seconds.
+    # LeRobot's progress bars of several processes would overwrite each other and the parent's. tqdm reads this variable
+    # when a worker imports it, and shows no bar before so many seconds.
     os.environ["TQDM_DELAY"] = "1000000000"
     return map_in_workers(_run_in_worker, tasks, workers, _start_worker, cfg, threads)
 
@@ -70,9 +70,9 @@ def evaluate(cfg: EvaluateConfig) -> list[Record]:
     The records file appears when the last rollout is done; until then its lines are in `<name>.part`.
 
     Raises:
-        ValueError: see `EvaluateConfig.validate`.
-        FileExistsError, BlockingIOError: see `new_records`.
-        ValueError, FileNotFoundError: the checkpoint is not whole, or its processors name code of their own.
+        ValueError: See `EvaluateConfig.validate`.
+        FileExistsError, BlockingIOError: See `new_records`.
+        ValueError, FileNotFoundError: The checkpoint is damaged or incomplete, or its processors name other code.
     """
     cfg.validate()
     with new_records(cfg.records_file):
@@ -81,7 +81,8 @@ def evaluate(cfg: EvaluateConfig) -> list[Record]:
 
 def _evaluate(cfg: EvaluateConfig) -> list[Record]:
     open_checkpoint(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
-    if isinstance(cfg.policy, PolicyConfig):  # small: a broken one is found before environments are built
+    if isinstance(cfg.policy, PolicyConfig):
+        # These are small: a damaged one is found before environments are built.
         make_policy(deepcopy(cfg.policy), env_cfg=cfg.env, rename_map=cfg.rename_map)
     tasks = task_names(cfg)
     revision = cfg.policy.pretrained_revision
@@ -95,28 +96,28 @@ def _evaluate(cfg: EvaluateConfig) -> list[Record]:
 def _write_records(cfg: EvaluateConfig, tasks: list[str]) -> list[Record]:
     started = time.perf_counter()
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
-    cfg.records_file.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = cfg.records_file.with_name(cfg.records_file.name + ".part")
     records: list[Record] = []
-    rollouts = _rollouts(cfg, tasks)  # LeRobot prints as it loads the policy: not into the bar
+    # Before the bar, because LeRobot prints while it loads the policy.
+    rollouts = _rollouts(cfg, tasks)
     total = len(tasks) * len(cfg.seeds)
-    # Where there is no terminal, LeRobot's bar beneath this one would leave cursor movements in the file.
+    # Without a terminal, LeRobot's bar below this one would print cursor movements.
     progress = tqdm(total=total, desc="Rolling out", unit="rollout", disable=None)
-    with unfinished.open("w") as file, progress:
-        for of_task in rollouts:
-            records += of_task
-            file.writelines(map(record_line, of_task))
-            file.flush()
-            progress.update(len(of_task))
-            if progress.disable:
-                logging.info("%d of %d rollouts", len(records), total)
-    _write_info(cfg, records, seconds=time.perf_counter() - started)
-    unfinished.rename(cfg.records_file)  # last: where it is, all is
+    # The records appear last, when everything else is written.
+    with appears_whole(cfg.records_file) as temporary:
+        with temporary.open("w") as file, progress:
+            for task_records in rollouts:
+                records += task_records
+                file.writelines(map(record_line, task_records))
+                file.flush()
+                progress.update(len(task_records))
+                if progress.disable:
+                    logging.info("%d of %d rollouts", len(records), total)
+        _write_info(cfg, records, seconds=time.perf_counter() - started)
     return records
 
 
 def _write_info(cfg: EvaluateConfig, records: list[Record], seconds: float) -> None:
-    """eval_info.json: success rates with intervals per task, per split and overall, and what made them."""
+    """Write eval_info.json: success rates with intervals per task, split and overall, and their provenance."""
 
     def chosen(split: str) -> list[Record]:
         return [record for record in records if is_in_split(record, split)]

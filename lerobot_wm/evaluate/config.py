@@ -1,4 +1,4 @@
-"""The flags of `lerobot-wm eval`: lerobot-eval's and those of the records."""
+"""The flags of `lerobot-wm eval`: those of `lerobot-eval`, and of the records."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,10 +16,10 @@ from lerobot_wm.policies.latent.config import LatentPolicyConfig
 
 @dataclass
 class BatchedEvalConfig(EvalConfig):
-    """LeRobot's `--eval.*` flags, with defaults for cheap environments.
+    """LeRobot's `--eval.*` flags, with defaults for fast environments.
 
-    One batch of environments in the policy's own process: a worker process per environment costs more (each
-    imports torch) than it gains where a step with its image takes a few milliseconds.
+    Environments run in the policy's own process: where a step takes a few milliseconds, a process for each environment
+    costs more than it gains, because each imports torch.
     """
 
     batch_size: int = 25
@@ -28,7 +28,7 @@ class BatchedEvalConfig(EvalConfig):
 
 @dataclass
 class EvaluateConfig(EvalPipelineConfig):
-    """LeRobot's evaluation flags and those of the records."""
+    """LeRobot's evaluation flags, and those of the records."""
 
     eval: BatchedEvalConfig = field(default_factory=BatchedEvalConfig)
     # Records file to write; <output_dir>/records.jsonl when not given.
@@ -39,31 +39,29 @@ class EvaluateConfig(EvalPipelineConfig):
     preset: str = "custom"
     # Processes; each takes whole tasks.
     num_workers: int = 1
-    # How many rollouts of each task, the first ones, are kept as videos.
+    # How many rollouts of each task are saved as videos, from the first one on.
     videos_per_task: int = 1
-    # `--wandb.enable=true` logs the tables to the run that trained the policy.
+    # `--wandb.enable=true` logs tables to the run that trained the policy.
     wandb: WandBConfig = field(default_factory=WandBConfig)
 
     def validate(self) -> None:
-        """Refuse what cannot run, before anything is loaded.
+        """Check the flags before anything is loaded.
 
         Raises:
-            ValueError: no policy, no seed, a rollout that would run twice, a flag that belongs elsewhere, or an
-                environment that the policy was not trained for.
+            ValueError: There is no policy or no seed, a rollout would run twice, a flag is not supported here, or the
+                policy was not trained for the environment.
         """
         if self.policy is None:
             raise ValueError("No policy: give --policy.path=CHECKPOINT_FOLDER_OR_HUB_ID.")
         if self.seed is None:
-            raise ValueError(
-                "--seed=null: each rollout needs its seed. Give the first one, such as --seed=0."
-            )
+            raise ValueError("--seed=null: each rollout needs a seed. Give the first one, such as --seed=0.")
         if self.num_workers < 1:
             raise ValueError(f"--num_workers={self.num_workers}: expected at least 1.")
         if self.eval.recording:
-            raise ValueError("--eval.recording=true records datasets: use `lerobot-eval` for that.")
+            raise ValueError("--eval.recording=true is not supported: use `lerobot-eval` to record datasets.")
         if isinstance(self.policy, LatentPolicyConfig) and self.policy.save_predicted_video:
             raise ValueError(
-                "--policy.save_predicted_video=true films predictions: use `lerobot-eval` for that."
+                "--policy.save_predicted_video=true is not supported: use `lerobot-eval` for videos of predictions."
             )
         n_variations = len({variation_of(self.env, seed) for seed in self.seeds})
         if n_variations < self.eval.n_episodes:
@@ -73,7 +71,7 @@ class EvaluateConfig(EvalPipelineConfig):
             )
         if self.policy.pretrained_path is None:
             raise ValueError(
-                f"--policy.type={self.policy.type} alone would be untrained: give --policy.path=CHECKPOINT."
+                f"--policy.type={self.policy.type} is an untrained policy: give --policy.path=CHECKPOINT."
             )
         check_fit(self.policy, self.env, self.rename_map)
 
@@ -84,7 +82,7 @@ class EvaluateConfig(EvalPipelineConfig):
 
     @property
     def arm_name(self) -> str:
-        """The name of the method in records."""
+        """The method's name in records."""
         return self.arm or self.policy.type
 
     @property
@@ -94,7 +92,7 @@ class EvaluateConfig(EvalPipelineConfig):
 
 
 def variation_of(env: EnvConfig, seed: int) -> tuple[int, bool | None]:
-    """What a record says of `reset(seed=seed)`: (variation, seen); for other environments (seed, None)."""
+    """(variation, seen) of `reset(seed=seed)`, for records; (seed, None) for other environments than metaworld_mt."""
     if not isinstance(env, MetaworldMTEnvConfig):
         return seed, None
     variations = split_variations(env.split, env.variation_set)

@@ -16,25 +16,22 @@ from lerobot.utils.io_utils import write_video
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_wm.evaluate.config import EvaluateConfig, variation_of
+from lerobot_wm.evaluate.wandb_log import training_config
 from lerobot_wm.records import Record
-from lerobot_wm.train.resume import training_config
 
-VIDEO_SIZE = 256  # frames are enlarged by a whole factor up to this height (pixels)
-
-
-def training_seed(policy_path: Path | None, revision: str | None = None) -> int | None:
-    """The seed a checkpoint (folder or Hub id) was trained with; None when it does not tell."""
-    return training_config(policy_path, revision).get("seed")
+# Frames of videos are enlarged by a whole factor up to this height in pixels.
+VIDEO_SIZE = 256
 
 
 class TaskRunner:
-    """A loaded policy and its environments, ready to roll out one task after the other."""
+    """A loaded policy and its environments, which rolls out one task after another."""
 
     def __init__(self, cfg: EvaluateConfig) -> None:
         self.cfg = cfg
         self.device = get_safe_torch_device(cfg.policy.device)
-        self.training_seed = training_seed(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
-        # One vector environment per batch size: a shorter last batch must not run further seeds.
+        trained = training_config(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
+        self.training_seed = trained.get("seed")
+        # One vector environment per batch size, so that a shorter last batch runs no other seeds.
         sizes = {len(seeds) for seeds in self._batches()}
         self.envs = {size: make_task_envs(cfg, size) for size in sizes}
         self.policy = make_policy(cfg=cfg.policy, env_cfg=cfg.env, rename_map=cfg.rename_map).eval()
@@ -56,11 +53,11 @@ class TaskRunner:
         }
 
     def run(self, task: str) -> list[Record]:
-        """Roll out every seed of one task once; its videos of an earlier evaluation are removed."""
-        # Written over, a rollout that now ends otherwise would leave both outcomes.
+        """Roll out every seed of one task once."""
+        # A rollout may now end differently than in an earlier evaluation, and its video would have another name.
         for video in self._videos(task).glob("variation_*_*.mp4"):
             video.unlink()
-        # Per task: a stochastic policy's rollouts must not depend on how tasks are spread over processes.
+        # For each task, so that rollouts do not depend on how tasks are spread over processes.
         set_seed(self.cfg.seed)
         records: list[Record] = []
         for seeds in self._batches():
@@ -85,14 +82,14 @@ class TaskRunner:
                 render_callback=(lambda env: frames.append(_render(env, filmed))) if filmed else None,
             )
         records = [self._record(task, seed, data, i) for i, seed in enumerate(seeds)]
-        # Else it has begun anew when it is looked at: the last picture is of the next episode's start.
+        # Otherwise the environment is reset before it is rendered: the last frame is the start of another episode.
         shows_the_end = env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP
         for column, i in enumerate(filmed):
             clip = [step[column] for step in frames[: records[i]["steps"] + shows_the_end]]
-            outcome = "success" if records[i]["success"] else "failure"
+            result = "success" if records[i]["success"] else "failure"
             folder = self._videos(task)
             folder.mkdir(parents=True, exist_ok=True)
-            path = folder / f"variation_{records[i]['variation']:02d}_{outcome}.mp4"
+            path = folder / f"variation_{records[i]['variation']:02d}_{result}.mp4"
             write_video(path, [_enlarged(frame) for frame in clip], env.metadata["render_fps"])
         return records
 
@@ -118,16 +115,16 @@ class TaskRunner:
 
 
 def task_names(cfg: EvaluateConfig) -> list[str]:
-    """The tasks of the environment configuration, as records name them."""
+    """Names of the environment's tasks, as in records."""
     envs = make_task_envs(cfg, n_envs=1)
     close_envs(envs)
     return list(envs)
 
 
 def make_task_envs(cfg: EvaluateConfig, n_envs: int) -> dict[str, gym.vector.VectorEnv]:
-    """Task name -> vector environment with `n_envs` sub-environments.
+    """Make a vector environment with `n_envs` sub-environments for each task.
 
-    LeRobot's form is {group: {task id: vector environment}}, where metaworld_mt's groups are its tasks.
+    LeRobot returns {group: {task id: vector environment}}; the groups of metaworld_mt are its tasks.
     """
     groups = make_env(cfg.env, n_envs, cfg.eval.use_async_envs, trust_remote_code=cfg.trust_remote_code)
     return {
@@ -138,14 +135,14 @@ def make_task_envs(cfg: EvaluateConfig, n_envs: int) -> dict[str, gym.vector.Vec
 
 
 def _render(env: gym.vector.VectorEnv, indices: list[int]) -> list[np.ndarray]:
-    """Current images (H, W, 3) of the chosen sub-environments."""
+    """Current images (H, W, 3) of some sub-environments."""
     if isinstance(env, gym.vector.SyncVectorEnv):
         return [np.asarray(env.envs[i].render()) for i in indices]
-    images = env.call("render")  # type: ignore[attr-defined]  # asynchronous ones have it
+    images = env.call("render")  # type: ignore[attr-defined]
     return [images[i] for i in indices]
 
 
 def _enlarged(image: np.ndarray) -> np.ndarray:
-    """(H, W, 3) -> (fH, fW, 3) with a whole factor f: players blur a 64-pixel video."""
+    """(H, W, 3) -> (fH, fW, 3) with a whole factor f, because players blur small videos."""
     factor = max(1, VIDEO_SIZE // image.shape[0])
     return image.repeat(factor, axis=0).repeat(factor, axis=1)

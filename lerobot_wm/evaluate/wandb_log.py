@@ -1,39 +1,58 @@
-"""Dreams and tables of evaluations, logged to the Weights & Biases run that holds a checkpoint's losses."""
+"""Logging to the Weights & Biases run that trained a checkpoint."""
 
+import json
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs.default import WandBConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.import_utils import require_package
 
+from lerobot_wm.policies.common.checkpoint import checkpoint_file
 from lerobot_wm.records import Record, is_in_split, present_splits, summarize_success
 from lerobot_wm.tables import cell_text, table_by_split
-from lerobot_wm.train.resume import training_config
 
 if TYPE_CHECKING:
-    import wandb  # takes seconds to import, which only those wait for who log to it
+    # Takes seconds to import, and only some users log to it.
+    import wandb
+
+logger = logging.getLogger(__name__)
+
+
+def training_config(policy_path: Path | None, revision: str | None = None) -> dict[str, Any]:
+    """Settings of the run that trained a checkpoint (folder or Hub id); empty if the checkpoint lacks them."""
+    try:
+        file = None if policy_path is None else checkpoint_file(policy_path, TRAIN_CONFIG_NAME, revision)
+    except LocalEntryNotFoundError:  # offline, with a cached checkpoint
+        logger.warning(
+            "%s of %s is not on this machine, and the Hub is unreachable.", TRAIN_CONFIG_NAME, policy_path
+        )
+        return {}
+    return {} if file is None else json.loads(file.read_text())
 
 
 @contextmanager
 def wandb_run(
     cfg: WandBConfig, policy_path: Path | None, folder: Path, revision: str | None = None
 ) -> Iterator["wandb.Run | None"]:
-    """The run to log to: the one that trained the checkpoint, else, where that logged nothing, a new one.
+    """Open the wandb run that trained a checkpoint, or a new one if that training did not log to wandb.
 
     Args:
-        cfg: LeRobot's `--wandb.*` flags. With a `run_id` that run is taken. Without `mode` it is that of the training.
-        policy_path: The checkpoint: folder or Hub id.
-        folder: Where wandb keeps its files.
-        revision: The checkpoint's branch, tag or commit on the Hub.
+        cfg: LeRobot's `--wandb.*` flags. `run_id` selects another run. Without `mode` the training's mode is used.
+        policy_path: Folder or Hub id of the checkpoint.
+        folder: Folder for wandb's files.
+        revision: Branch, tag or commit of the checkpoint on the Hub.
 
     Yields:
         The run; None without `--wandb.enable=true`.
 
     Raises:
         ImportError: wandb is not installed.
-        RuntimeError: wandb takes no run: there is no login, no network, or no such mode.
+        RuntimeError: wandb opens no run: there is no login, no network, or no such mode.
     """
     if not cfg.enable:
         yield None
@@ -52,24 +71,26 @@ def wandb_run(
             resume="allow",
             mode=cfg.mode or chosen.mode,
             dir=folder,
-            settings=wandb.Settings(silent=True),  # as in LeRobot's training
+            # As in LeRobot's training.
+            settings=wandb.Settings(silent=True),
         )
     except (wandb.Error, ValueError) as error:
         raise RuntimeError(
-            f"wandb takes no run ({error}): log in with `wandb login`, or give --wandb.mode=offline."
+            f"cannot open a wandb run ({error}): log in with `wandb login`, or give --wandb.mode=offline."
         ) from error
     print(f"wandb: {run.settings.sync_dir if run.offline else run.url}")
     try:
         yield run
     finally:
-        run.finish()  # an error here is no failure of the training, which is what the run stands for
+        # Without an exit code: an error here does not mean that the training failed.
+        run.finish()
 
 
 def log_evaluation(run: "wandb.Run", arm: str, records: list[Record]) -> None:
-    """Log the success table, a table of the rollouts, and success per cent of each split.
+    """Log the success table, a table of rollouts, and the success rate in per cent of each split.
 
     Args:
-        run: Where to.
+        run: The run.
         arm: Name of the method.
         records: One for each rollout; at least one.
     """

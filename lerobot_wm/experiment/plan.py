@@ -28,8 +28,8 @@ from lerobot_wm.data.schema import COLLECTION_RECORD, RELABEL_RECORD
 from lerobot_wm.experiment.preset import Preset, config_file
 from lerobot_wm.experiment.stage import Checkpoint, Dataset, Stage, lerobot_wm
 from lerobot_wm.report.arms import WM_RSSM, Arm, Encoder
-from lerobot_wm.system import parts_folder, shards_folder
 from lerobot_wm.train.resume import can_resume
+from lerobot_wm.workers import parts_folder, shards_folder
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.files import write_whole
-from lerobot_wm.system import held_back
+from lerobot_wm.workers import delay_signals
 
 
 class Times:
@@ -298,7 +298,7 @@ class Runner:
         side_by_side = min(self._processes, len(self._running) + len(ready))
         for stage in ready[: self._processes - len(self._running)]:
             self._progress.started(stage)
-            with held_back(signal.SIGINT, signal.SIGTERM):
+            with delay_signals(signal.SIGINT, signal.SIGTERM):
                 self._running.append(StageProcess(stage, max(1, self._cores // side_by_side), lock))
             del self._waiting[stage.name]
 

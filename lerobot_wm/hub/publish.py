@@ -15,9 +15,8 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from PIL import Image
 
-from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.data.source import dataset_folder
-from lerobot_wm.hub.errors import check_can_push
+from lerobot_wm.data.source import SourceConfig, dataset_folder
+from lerobot_wm.errors import check_can_push
 from lerobot_wm.inspect.episodes import CheckpointConfig, check_features, load_world_model
 from lerobot_wm.inspect.open_loop import CONTEXT, OpenLoop, open_loop, psnr_table
 from lerobot_wm.markdown import escaped

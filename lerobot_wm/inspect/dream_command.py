@@ -8,14 +8,14 @@ import draccus
 from lerobot.configs.default import WandBConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.evaluate.wandb_log import wandb_run
 from lerobot_wm.inspect.dream import Dreams, dream, strip_figure, write_dream
 from lerobot_wm.inspect.episodes import CheckpointConfig, check_features, load_world_model, read_episodes
 from lerobot_wm.inspect.open_loop import CONTEXT
 from lerobot_wm.inspect.pictures import PNG, figure_bytes
 from lerobot_wm.policies.common.checkpoint import split_revision
-from lerobot_wm.quiet import quiet, silence
+from lerobot_wm.system import quiet, silence
 
 if TYPE_CHECKING:  # wandb takes seconds to import
     import wandb

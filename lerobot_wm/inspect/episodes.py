@@ -10,7 +10,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.nn.images import camera_images, resize_images
 from lerobot_wm.policies.latent.policy import LatentPolicy, load_encoder
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig

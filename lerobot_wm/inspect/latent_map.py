@@ -13,7 +13,7 @@ from sklearn.decomposition import PCA
 from tqdm import tqdm
 
 from lerobot_wm.constants import TASK
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import (
     ImaginingPolicy,
     episodes_by_task,

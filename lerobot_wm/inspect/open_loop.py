@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_wm.constants import ACTION, TASK
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import (
     ImaginingPolicy,
     episodes_by_task,

@@ -9,7 +9,7 @@ import draccus
 import torch
 
 from lerobot_wm.constants import QUALITY_NAME
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import episodes_by_task, load_world_model, rssm_of, world_model_config
 from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, WINDOW
 from lerobot_wm.inspect.pictures import PNG, SVG, figure_bytes

@@ -12,7 +12,7 @@ from tqdm import trange
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, SUCCESS, VARIATION
 from lerobot_wm.data.cache import camera_frames
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.data.tables import column_tensor
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.nn.images import stack_images

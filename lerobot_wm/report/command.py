@@ -7,7 +7,7 @@ import draccus
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from rich.console import Console
 
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import ImaginingPolicy, check_features, load_world_model
 from lerobot_wm.inspect.latent_map import latent_figures, latent_map
 from lerobot_wm.inspect.open_loop import open_loop, psnr_table, strips_figure

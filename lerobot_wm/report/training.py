@@ -17,8 +17,8 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE, TRAIN_LOG_NAME
 from lerobot_wm.data.cache import frame_shape
-from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.schema import COLLECTION_RECORD
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import episodes_by_task
 from lerobot_wm.inspect.pictures import WEBP, data_uri, shorten
 from lerobot_wm.policies.common.iql import reward_columns

@@ -11,7 +11,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from tqdm import tqdm
 
 from lerobot_wm.constants import TASK
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.dream import Dreams, dream, strip_figure, write_dream
 from lerobot_wm.inspect.episodes import ImaginingPolicy, episodes_by_task, read_episodes
 from lerobot_wm.inspect.open_loop import CONTEXT

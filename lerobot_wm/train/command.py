@@ -8,15 +8,14 @@ from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.logging_utils import MetricsTracker
 
 from lerobot_wm.constants import OBS_LATENT, TRAIN_LOG_NAME
-from lerobot_wm.data.check import check_dataset, damage_named
-from lerobot_wm.encode.command import LATENTS_PREFIX, encode_to_cache
+from lerobot_wm.data.source import damaged_tables_named, open_dataset
+from lerobot_wm.encode.dataset import LATENTS_PREFIX, encode_to_cache
+from lerobot_wm.errors import check_can_push
 from lerobot_wm.files import sole_writer
-from lerobot_wm.hub.errors import check_can_push, check_dataset_version
 from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config
 from lerobot_wm.policies.common.checks import check_fit, names_given_by
 from lerobot_wm.policies.common.config import PolicyConfig
@@ -46,19 +45,19 @@ def train_log(output_dir: Path) -> Iterator[None]:
         logger.removeFilter(note)
 
 
-def encode_if_needed(cfg: TrainPipelineConfig) -> None:
-    """Point a latent policy's training at latents, encoding an image dataset first, once, into its cache.
+def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
+    """Check the dataset; for a policy on latents, encode an image dataset into its cache and train on that.
 
     Args:
         cfg: Changed in place: its dataset becomes the encoded one.
 
     Raises:
-        ValueError: The policy and the dataset do not fit; nothing was encoded.
+        ValueError: The dataset is damaged, or does not fit the policy; nothing was encoded.
     """
     policy = cfg.policy
+    meta = open_dataset(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     if not isinstance(policy, PolicyConfig):
         return
-    meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
     check_fit(policy, meta, cfg.rename_map)
     if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent or OBS_LATENT in meta.features:
         return
@@ -127,14 +126,12 @@ def train(cfg: TrainPipelineConfig) -> None:
             check_latents_are_there(cfg)
             if processes.is_main_process:
                 clear_unfinished(cfg.checkpoint_path, cfg.output_dir)
-        check_dataset(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
-        check_dataset_version(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
-        # One process of each machine encodes, the others find it done.
+        # One process of each machine downloads and encodes, the others find it done.
         with processes.main_process_first(), processes.local_main_process_first():
-            encode_if_needed(cfg)
+            open_dataset_and_encode(cfg)
         with (
             train_log(cfg.output_dir),
-            damage_named(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision),
+            damaged_tables_named(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision),
             names_given_by(cfg.rename_map),
         ):
             train_from_memory(cfg)

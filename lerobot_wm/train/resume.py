@@ -11,9 +11,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
-from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import (
     CHECKPOINTS_DIR,
@@ -26,7 +24,6 @@ from lerobot.utils.constants import (
 )
 
 from lerobot_wm.errors import disk_problem
-from lerobot_wm.policies.common.checkpoint import checkpoint_file
 
 logger = logging.getLogger(__name__)
 
@@ -121,16 +118,6 @@ def is_complete(checkpoint: Path) -> bool:
     except (OSError, ValueError, KeyError, TypeError):
         return False
     return True
-
-
-def training_config(policy_path: Path | None, revision: str | None = None) -> dict[str, Any]:
-    """The settings of the run that trained a checkpoint (folder or Hub id); empty where they are not known."""
-    try:
-        file = None if policy_path is None else checkpoint_file(policy_path, TRAIN_CONFIG_NAME, revision)
-    except LocalEntryNotFoundError:  # the rest of the checkpoint is here
-        logger.warning("%s of %s is not here, and the Hub cannot be reached.", TRAIN_CONFIG_NAME, policy_path)
-        return {}
-    return {} if file is None else json.loads(file.read_text())
 
 
 def _how_to_resume(output_dir: Path) -> str:

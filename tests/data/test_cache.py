@@ -1,6 +1,5 @@
 """Frames decoded by several processes at once."""
 
-import os
 from multiprocessing import get_context
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import Barrier
@@ -39,7 +38,7 @@ def test_processes_that_start_together_share_one_file(tmp_path: Path) -> None:
     for process in processes:
         process.join()
     assert seen == [PROCESSES] * (PROCESSES * ROUNDS)
-    assert not list(tmp_path.glob("*.tmp"))
+    assert not list(tmp_path.glob("*.part"))
 
 
 def test_a_dataset_in_the_current_folder_has_its_cache_beside_it(
@@ -64,13 +63,3 @@ def test_frames_of_earlier_versions_are_named(tmp_path: Path, caplog: pytest.Log
     camera_frames(dataset, FRONT)
     [told] = [record.message for record in caplog.records if "earlier versions" in record.message]
     assert str(first) in told
-
-
-def test_file_systems_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_links(source: Path, target: Path) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "link", no_links)
-    CameraCache._open(tmp_path / "frames.npy", (3,))[:] = 7
-    assert CameraCache._open(tmp_path / "frames.npy", (3,)).tolist() == [7, 7, 7]
-    assert [path.name for path in tmp_path.iterdir()] == ["frames.npy"]

@@ -11,7 +11,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import TRAINING_STEP
 
-from lerobot_wm.encode.command import encode
+from lerobot_wm.encode.dataset import encode
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from tests.faults.breakage import Fault, cut, remove
 from tests.faults.checkpoints import (

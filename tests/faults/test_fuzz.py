@@ -16,8 +16,7 @@ from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.data.check import check_dataset
-from lerobot_wm.data.source import DatasetError
+from lerobot_wm.data.source import DatasetError, open_dataset
 from lerobot_wm.errors import exit_with_one_line
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
@@ -135,7 +134,7 @@ def check_metadata(draw: Callable[..., Any], name: str, root: Path) -> None:
             write_table(draw, path, original)
         message = ""
         try:
-            check_dataset("test/recorded", root)
+            open_dataset("test/recorded", root)
         except DatasetError as error:
             message = str(error)
         assert message.isprintable()

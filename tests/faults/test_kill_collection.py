@@ -14,7 +14,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.collect.command import CollectConfig, collect, plan_shards
-from lerobot_wm.collect.shards import SHARD_RECORD, TEMPORARY_PREFIX
+from lerobot_wm.collect.shards import SHARD_RECORD
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from tests.faults.killing import WatchedCommands, digests
 from tests.faults.running import processes_of, wait_until
@@ -74,13 +74,13 @@ def test_killed_and_started_again(undisturbed: Path, tmp_path: Path) -> None:
     """Two workers, killed when a shard is finished: nothing is lost, left over or different."""
     root, shards = tmp_path / "dataset", tmp_path / "dataset.shards"
     run = subprocess.Popen(command(root), process_group=0, stderr=subprocess.DEVNULL)
-    wait_until(lambda: list(shards.glob(f"*-v3-*/{SHARD_RECORD}")) or run.poll() is not None)
+    wait_until(lambda: list(shards.glob(f"*-v3-00000/{SHARD_RECORD}")) or run.poll() is not None)
     assert run.poll() is None
     os.kill(run.pid, signal.SIGKILL)
     run.wait()
     wait_until(lambda: not processes_of(run.pid))  # workers end with their parent
 
-    finished = [path.parent for path in shards.glob(f"[!u]*/{SHARD_RECORD}")]
+    finished = [path.parent for path in shards.glob(f"*-v3-00000/{SHARD_RECORD}")]
     assert 1 <= len(finished) < SHARDS
     for shard in finished:
         assert LeRobotDataset("user/shard", root=shard).num_episodes == EPISODES
@@ -112,7 +112,7 @@ def test_killed_at_random_moments(undisturbed: Path, tmp_path: Path) -> None:
     while killed < 20:
         if killed_at_random(root, moments):
             killed += 1
-            for shard in shards.glob("[!u]*"):  # not in work: whole
+            for shard in shards.glob("*-v3-00000"):
                 assert LeRobotDataset("user/shard", root=shard).num_episodes == EPISODES
         if root.exists():  # killed at its very end, or it was faster
             assert contents(root) == contents(undisturbed)
@@ -125,12 +125,10 @@ def test_killed_at_random_moments(undisturbed: Path, tmp_path: Path) -> None:
 
 def killed_at_random(root: Path, moments: random.Random) -> bool:
     """Go on with a collection, and kill its processes, unless they are faster, once one has begun a shard."""
-    begun = set(root.parent.glob(f"dataset.shards/{TEMPORARY_PREFIX}*"))
+    begun = set(root.parent.glob("dataset.shards/*.part"))
     start = time.monotonic()
     run = subprocess.Popen(command(root), process_group=0, stderr=subprocess.DEVNULL)
-    wait_until(
-        lambda: set(root.parent.glob(f"dataset.shards/{TEMPORARY_PREFIX}*")) - begun or run.poll() is not None
-    )
+    wait_until(lambda: set(root.parent.glob("dataset.shards/*.part")) - begun or run.poll() is not None)
     time.sleep(moments.uniform(0, time.monotonic() - start))  # as slow as the machine is now
     if run.poll() is None:
         os.killpg(run.pid, signal.SIGKILL)

@@ -12,8 +12,8 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.latents import RECORD_PATH
-from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.encode.command import encode
+from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.encode.dataset import encode
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.hub.publish import PublishConfig, publish
 from lerobot_wm.inspect.episodes import CheckpointConfig

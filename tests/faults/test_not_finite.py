@@ -15,8 +15,7 @@ from lerobot.policies import make_policy
 
 from lerobot_wm.collect.shards import Shard, write_shard
 from lerobot_wm.data.loader import RamDataset
-from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.data.source import DatasetError
+from lerobot_wm.data.source import DatasetError, SourceConfig
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.policies.common.divergence import DivergenceError, check_finite, check_finite_weights
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig

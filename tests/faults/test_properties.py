@@ -15,9 +15,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_wm.collect.merge import merge_datasets
-from lerobot_wm.data.check import check_dataset
 from lerobot_wm.data.loader import RamDataset, gather
-from lerobot_wm.system import Share
+from lerobot_wm.data.source import open_dataset
+from lerobot_wm.workers import Job
 from tests.recording import record, vector
 
 SETTINGS: dict[str, Any] = {"deadline": None, "database": None, "derandomize": True}
@@ -74,7 +74,7 @@ def test_gathering_is_indexing(data: st.DataObject, rows: int, length: int) -> N
 def test_shares_are_everything_once_and_even(n_parts: int, count: int) -> None:
     if count > n_parts:
         return
-    shares = [Share(index, count).of(range(n_parts)) for index in range(1, count + 1)]
+    shares = [Job(index, count).select(range(n_parts)) for index in range(1, count + 1)]
     assert sorted(part for share in shares for part in share) == list(range(n_parts))
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
 
@@ -89,7 +89,7 @@ def test_merging_keeps_every_frame_and_its_statistics(groups: list[list[int]]) -
         ]
         merged = Path(folder) / "merged"
         merge_datasets(sources, "test/merged", merged)
-        check_dataset("test/merged", merged)
+        open_dataset("test/merged", merged)
         before = pd.concat([table_of(source) for source in sources], ignore_index=True)
         after = table_of(merged)
         pd.testing.assert_frame_equal(after[["task", "state", "action"]], before[["task", "state", "action"]])

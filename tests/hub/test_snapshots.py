@@ -22,8 +22,7 @@ from pathlib import Path
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
-from lerobot_wm.data.check import check_dataset
-from lerobot_wm.data.source import dataset_folder
+from lerobot_wm.data.source import dataset_folder, open_dataset
 name = "user/demos"
 """
 
@@ -65,12 +64,12 @@ def test_a_download_of_some_episodes_passes(machine: Machine) -> None:
         """
 dataset = LeRobotDataset(name, episodes=[0])
 (dataset.root / "README.md").unlink(missing_ok=True)
-check_dataset(name)
+open_dataset(name)
 shutil.rmtree(dataset.root / "videos")
 next((dataset.root / "data").rglob("*.parquet")).resolve().unlink()  # leaves a link to nothing
-check_dataset(name)
+open_dataset(name)
 (dataset.root / "meta/tasks.parquet").unlink()  # broken off before that
-check_dataset(name)
+open_dataset(name)
 assert len(LeRobotDataset(name)) and dataset_folder(name, whole=True) == dataset.root
 """,
     )

@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import nn
 from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTensorMode
 
-from lerobot_wm.encode.command import encode_to_cache
+from lerobot_wm.encode.dataset import encode_to_cache
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.checkpoint import CheckpointError
 from lerobot_wm.policies.common.iql import IQLConfig

@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from lerobot_wm.data.latents import LatentRecord
-from lerobot_wm.encode.command import encode_to_cache
+from lerobot_wm.encode.dataset import encode_to_cache
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone, load_backbone_weights
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
 from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.data.latents import LatentRecord
-from lerobot_wm.encode.command import encode_to_cache
+from lerobot_wm.encode.dataset import encode_to_cache
 from lerobot_wm.policies.common.iql import IQLConfig
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
@@ -397,7 +397,7 @@ def test_a_dataset_that_is_still_to_be_downloaded_is_encoded_once(
             shutil.copytree(demos_root / folder, root / folder, dirs_exist_ok=True)
         return LeRobotDataset(*args, **kwargs)
 
-    monkeypatch.setattr("lerobot_wm.encode.command.LeRobotDataset", download)
+    monkeypatch.setattr("lerobot_wm.encode.dataset.LeRobotDataset", download)
     meta = LeRobotDatasetMetadata("test/demos", root=root)
     first = encode_to_cache(str(world_model_path), "test/demos", meta, "cpu")
     assert encode_to_cache(str(world_model_path), "test/demos", meta, "cpu") == first

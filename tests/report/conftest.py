@@ -10,7 +10,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import ACTION, FPS, OBS_IMAGE, OBS_STATE
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.inspect.open_loop import WINDOW
 from lerobot_wm.inspect.quality import QualityConfig, quality

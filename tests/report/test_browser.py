@@ -13,8 +13,8 @@ from lerobot.utils.io_utils import write_video
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
-from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.schema import COLLECTION_RECORD
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.open_loop import WINDOW
 from lerobot_wm.records import Record, record_line
 from lerobot_wm.report.command import ReportConfig, report

@@ -13,7 +13,7 @@ from lerobot.utils.io_utils import write_video
 from PIL import Image
 
 from lerobot_wm import cli
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.pictures import MP4, data_uri
 from lerobot_wm.records import record_line
 from lerobot_wm.report import rollouts

@@ -9,7 +9,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.report.training import summarise_data
 from tests.recording import FRAME_SHAPES, record_stranger
 

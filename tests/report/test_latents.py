@@ -9,7 +9,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.inspect.latent_map import (
     FRAMES_PER_EPISODE,

@@ -13,7 +13,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.inspect.open_loop import (
     CONTEXT,

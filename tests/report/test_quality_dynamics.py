@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lerobot_wm.constants import OBS_IMAGE
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.quality_episodes import Episode, Filtered, filter_episodes, read_demonstrations
 from lerobot_wm.inspect.quality_measures import drift, kl_quality, reward_quality
 from lerobot_wm.world_model.model import WorldModel

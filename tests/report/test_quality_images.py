@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.inspect.open_loop import WINDOW, predict
 from lerobot_wm.inspect.quality_episodes import (

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from lerobot_wm.constants import OBS_IMAGE
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.inspect.quality_episodes import filter_episodes, read_demonstrations
 from lerobot_wm.inspect.quality_probes import (

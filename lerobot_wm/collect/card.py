@@ -1,18 +1,15 @@
-"""Cards of the datasets our commands make, and pushing them with LeRobot's own `push_to_hub`."""
+"""Pushing a collected dataset to the Hub, with a card that says how it was made."""
 
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import DatasetCard
 from huggingface_hub.constants import ENDPOINT
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
+from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.markdown import Markdown, render
 
-PAPER = "World Models for Multi-task Robotic Pretraining"
-META_WORLD_PAPER = "Meta-World, https://arxiv.org/abs/1910.10897"
 META_WORLD_BIBTEX = """@inproceedings{yu2019meta,
   title={Meta-World: A Benchmark and Evaluation for Multi-Task and Meta Reinforcement Learning},
   author={Yu, Tianhe and Quillen, Deirdre and He, Zhanpeng and Julian, Ryan and Hausman, Karol and Finn, Chelsea
@@ -23,13 +20,13 @@ META_WORLD_BIBTEX = """@inproceedings{yu2019meta,
 
 
 def push_demonstrations(dataset: LeRobotDataset, record: dict[str, Any], private: bool, license: str) -> None:
-    """Push a dataset of `lerobot-wm collect`; a reader sees it when all of it is there.
+    """Push a dataset of `lerobot-wm collect` and its card.
 
     Args:
         dataset: The dataset.
-        record: Its `meta/collection.json`.
-        private: Whether to make the repository private where it is new.
-        license: Its licence, as the Hub names it.
+        record: The content of its `meta/collection.json`.
+        private: Whether a new repository is private.
+        license: The dataset's licence, as the Hub names it.
     """
     episodes = record["episodes"]
     tasks = [
@@ -48,67 +45,16 @@ def push_demonstrations(dataset: LeRobotDataset, record: dict[str, Any], private
         fingerprint=dataset_fingerprint(Path(dataset.root)),
         command=Markdown(_collect_command(record["config"], dataset.repo_id)),
     )
-    _push(
-        dataset,
-        private,
-        license,
-        tags=["metaworld", "demonstrations"],
+    # LeRobot sets the version tag last, and reads nothing without it: readers see the dataset once it is complete.
+    dataset.push_to_hub(
+        tags=["lerobot_wm", "metaworld", "demonstrations"],
+        license=license,
+        private=private,
         dataset_description=description,
         url="https://meta-world.github.io",
-        paper=META_WORLD_PAPER,
+        paper="Meta-World, https://arxiv.org/abs/1910.10897",
         citation_bibtex=META_WORLD_BIBTEX,
     )
-
-
-def push_latents(
-    dataset: LeRobotDataset,
-    record: LatentRecord,
-    encoder: str,
-    encoder_path: str,
-    private: bool,
-    license: str | None,
-) -> None:
-    """Push a dataset of `lerobot-wm encode`; a reader sees it when all of it is there.
-
-    Args:
-        dataset: The dataset.
-        record: Its `meta/latents.json`.
-        encoder: What encoded it: "world model" or "image backbone".
-        encoder_path: Folder or Hub id of that.
-        private: Whether to make the repository private where it is new.
-        license: Its licence, as the Hub names it; None leaves it open.
-    """
-    description = render(
-        Path(__file__).with_name("latents.md.j2"),
-        repo_id=dataset.repo_id,
-        record=record,
-        encoder=encoder,
-        encoder_id=None if Path(encoder_path).exists() else encoder_path,
-        n_episodes=dataset.num_episodes,
-        n_frames=dataset.num_frames,
-        n_dims=dataset.features["observation.latent"]["shape"][0],
-        fingerprint=dataset_fingerprint(Path(dataset.root)),
-    )
-    _push(
-        dataset,
-        private,
-        license,
-        tags=["latents"],
-        dataset_description=description,
-        url=f"{ENDPOINT}/datasets/{record.source_repo_id}",
-        paper=PAPER,
-    )
-
-
-def license_of(dataset: LeRobotDataset) -> str | None:
-    """What the dataset's own card, where it came with one, says of its licence."""
-    card = Path(dataset.root) / "README.md"
-    return DatasetCard.load(card).data.license if card.is_file() else None
-
-
-def _push(dataset: LeRobotDataset, private: bool, license: str | None, tags: list[str], **card: str) -> None:
-    # LeRobot tags the version after all else, and reads nothing that has no such tag.
-    dataset.push_to_hub(tags=["lerobot_wm", *tags], license=license, private=private, **card)
     print(f"Dataset pushed to {ENDPOINT}/datasets/{dataset.repo_id}")
 
 
@@ -126,7 +72,7 @@ def _task_row(task: str, episodes: list[dict[str, Any]], record: dict[str, Any])
 
 
 def _ranges(numbers: list[int]) -> str:
-    """0, 1, 2, 5 as "0-2, 5"."""
+    """Write 0, 1, 2, 5 as "0-2, 5"."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][-1] + 1:
@@ -137,7 +83,7 @@ def _ranges(numbers: list[int]) -> str:
 
 
 def _collect_command(config: dict[str, Any], repo_id: str) -> str:
-    """The command that makes these demonstrations again."""
+    """The command that collects the same demonstrations again."""
     values = {**config, "tasks": ",".join(config["tasks"])}
     values["variations"] = _ranges(config["variations"]).replace(" ", "")
     return " ".join(
