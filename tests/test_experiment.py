@@ -13,7 +13,8 @@ from rich.console import Console
 from lerobot_wm.experiment.experiment import Experiment
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import load_preset
-from lerobot_wm.experiment.reproduce import hold_lock, main, show_failures
+from lerobot_wm.experiment.reproduce import main, show_failures
+from lerobot_wm.experiment.runner import hold_lock
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.records import read_records
 from lerobot_wm.report.arms import ARMS, Arm

@@ -137,13 +137,13 @@ def test_sweep_arms_roll_out_one_training(tmp_path: Path) -> None:
     assert [name for name, stage in stages.items() if stage.kind == "wm_iql"] == ["seed_0/wm_iql_sweep"]
     evaluations = [stage for stage in stages.values() if stage.kind == "evaluate"]
     assert len(evaluations) == 4
-    assert "--policy.beta=3" in stages["seed_0/eval_wm_iql_beta3"].argv
-    assert not [flag for flag in stages["seed_0/eval_wm_iql"].argv if flag.startswith("--policy.beta")]
+    assert "--policy.iql.beta=3" in stages["seed_0/eval_wm_iql_beta3"].argv
+    assert not [flag for flag in stages["seed_0/eval_wm_iql"].argv if flag.startswith("--policy.iql.beta")]
 
 
 def test_without_the_sweep_its_actors_are_not_trained(tmp_path: Path) -> None:
     alone = stages_of(tmp_path, "wm_iql", "wm_bc")["seed_0/wm_iql"]
-    assert not [flag for flag in alone.argv if "sweep" in flag]
+    assert not [flag for flag in alone.argv if "sweep_betas" in flag]
     wanted: dict[str, list[int]] = {"wm_iql": [0, 1], "wm_iql_beta3": [0]}
     at = replace(plan(tmp_path), preset=replace(load_preset("cpu"), arms=wanted))
     runs = select_runs(at.preset, [], [])
@@ -180,9 +180,10 @@ def test_a_training_killed_between_two_links_resumes_and_asking_writes_nothing(t
     saved = last.with_name("000500")
     for file, content in (
         ("pretrained_model/train_config.json", {"scheduler": None}),
+        ("training_state/training_step.json", {"step": 500}),
         ("training_state/optimizer_param_groups.json", []),
     ):
-        (saved / file).parent.mkdir(parents=True)
+        (saved / file).parent.mkdir(parents=True, exist_ok=True)
         (saved / file).write_text(json.dumps(content))
     assert training.is_resumable
     assert "--resume=true" in training.command(cores=1)

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from lerobot_wm.experiment.reproduce import hold_lock
-from lerobot_wm.experiment.runner import Progress, Runner, Times, minutes_left, ranks
+from lerobot_wm.experiment.runner import Progress, Runner, Times, hold_lock, minutes_left, ranks
 from lerobot_wm.experiment.stage import Stage, in_order, unfinished
 
 WRITE = "import os, pathlib, sys; f = pathlib.Path(sys.argv[1]); f.mkdir(parents=True)"
@@ -198,11 +197,8 @@ RUN = """
 import signal, sys
 from pathlib import Path
 from rich.console import Console
-from lerobot_wm.experiment.runner import Progress
-from lerobot_wm.experiment.reproduce import hold_lock
-from lerobot_wm.experiment.runner import Runner
+from lerobot_wm.experiment.runner import Progress, Runner, Times, hold_lock
 from lerobot_wm.experiment.stage import Stage
-from lerobot_wm.experiment.runner import Times
 for number in (signal.SIGINT, signal.SIGTERM):  # a shell lets its background jobs ignore SIGINT
     signal.signal(number, signal.default_int_handler)
 folder = Path(sys.argv[1])

@@ -1,13 +1,9 @@
 """`scripts/reproduce_table1.py`: any arms and seeds of the experiment, from demonstrations to the table."""
 
 import argparse
-import fcntl
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 from rich.console import Console
 
@@ -15,29 +11,10 @@ from lerobot_wm.constants import REPORTED_VARIATION_SET, VARIATION_SETS
 from lerobot_wm.experiment.experiment import Experiment
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import load_preset, select_runs, write_settings
+from lerobot_wm.experiment.runner import hold_lock
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.report.arms import ARMS
 from lerobot_wm.system import usable_cores
-
-
-@contextmanager
-def hold_lock(output_dir: Path) -> Iterator[IO]:
-    """Hold a folder's lock, which its running stages hold too.
-
-    Raises:
-        BlockingIOError: Another run, or a stage that a killed run left behind, still writes there.
-    """
-    output_dir.mkdir(parents=True, exist_ok=True)
-    with (output_dir / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BlockingIOError(
-                f"Another run, or a stage that a killed run left behind, still writes to {output_dir}: wait until it "
-                "has ended, stop it, or use another --output_dir."
-            ) from error
-        yield lock
-
 
 # Lines of a failed stage's log that are shown.
 LOG_TAIL = 15

@@ -1,12 +1,14 @@
 """Running stages side by side: the longest chains first, within the machine's cores."""
 
+import fcntl
 import json
 import os
 import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -75,6 +77,25 @@ def minutes_left(stages: Mapping[str, Stage], minutes: Mapping[str, float], proc
     """A lower bound of the minutes that `processes` need: the longest chain, or their share of the sum."""
     longest = max(ranks(stages, minutes).values(), default=0.0)
     return max(longest, sum(minutes[name] for name in stages) / processes)
+
+
+@contextmanager
+def hold_lock(output_dir: Path) -> Iterator[IO]:
+    """Hold a folder's lock, which its running stages hold too.
+
+    Raises:
+        BlockingIOError: Another run, or a stage that a killed run left behind, still writes there.
+    """
+    output_dir.mkdir(parents=True, exist_ok=True)
+    with (output_dir / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BlockingIOError(
+                f"Another run, or a stage that a killed run left behind, still writes to {output_dir}: wait until it "
+                "has ended, stop it, or use another --output_dir."
+            ) from error
+        yield lock
 
 
 # From SIGTERM to SIGKILL.
