@@ -168,6 +168,7 @@ def _begin(
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
     # Of a policy on latents, what its world model reads.
     model = policy.config.world_model if isinstance(policy, LatentPolicy) else policy.config
+    assert model is not None  # a policy with a world model
     check_reads(model, source.meta, rename_map)
     [state] = names_before([OBS_STATE], rename_map)
     if state not in source.meta.features:

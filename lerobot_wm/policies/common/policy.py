@@ -287,6 +287,10 @@ class ActingPolicy(BasePolicy):
         """Forget the episode; LeRobot calls this between episodes."""
         self._action_noise.reset()
 
+    def mean_action(self, observation: Tensor) -> Tensor:
+        """The policy's mean action for observations (B, O), clipped to the dataset's range, in its units: (B, A)."""
+        return self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))
+
     def act(self, observation: Tensor, batch: dict[str, Any]) -> Tensor:
         """The policy's mean action with `action_noise`, clipped to the dataset's range, in its units: (B, A).
 
@@ -294,7 +298,7 @@ class ActingPolicy(BasePolicy):
             observation: The networks' input, (B, O).
             batch: What `select_action` was given.
         """
-        action = self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))
+        action = self.mean_action(observation)
         if self.config.action_noise == 0:
             return action
         noisy = self._action_noise(self.action_scaling(action), batch)  # (B, A)
