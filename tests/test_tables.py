@@ -152,3 +152,18 @@ def test_precision_is_that_of_the_rollouts() -> None:
         assert list(row.values())[1:] == [
             success[arm_of(row)][key] for key in ("bfloat16", "float32", "difference")
         ]
+
+
+def test_pusht_is_that_of_the_evaluations() -> None:
+    def coverage(name: str) -> str:
+        measured = json.loads((RESULTS / "other_environments" / f"{name}.json").read_text())["overall"]
+        return f"{measured['avg_max_reward']:.2f}"
+
+    [_, *policies], [first, confirmed] = tables("docs/other_environments.md", "## PushT")
+    assert [list(row.values())[1].strip("*") for row in policies] == [
+        coverage(name) for name in ("pusht", "pusht_noise", "pusht_blind", "pusht_blind_noise")
+    ]
+    noises = {"0": "0.0", "0.05": "0.05", "0.1": "0.1", "0.2": "0.2", "0.4": "0.4"}
+    for title, noise in noises.items():
+        assert first[title].strip("*") == coverage(f"pusht_seed_2000_noise_{noise}")
+    assert confirmed["0.1"] == coverage("pusht_seed_3000")
