@@ -141,7 +141,7 @@ def _read_lines(path: Path) -> list[str]:
 
 def _parse(line: str, place: str) -> Record:
     try:
-        record = json.loads(line)
+        record: Record = json.loads(line)
     except json.JSONDecodeError as error:
         raise ValueError(f"{place} is not JSON ({error}): expected one record per line.") from error
     expected = Record.__required_keys__

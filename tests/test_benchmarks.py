@@ -187,7 +187,7 @@ def test_peers_have_the_settings_of_our_policies() -> None:
         assert config.dropout == agent_settings.DROPOUT
         assert config.lr == agent_settings.LEARNING_RATE
     config = WMIQLConfig(device="cpu")
-    assert (config.beta, config.expectile, config.discount, config.target_rate) == (
+    assert (config.iql.beta, config.iql.expectile, config.iql.discount, config.iql.target_rate) == (
         *(agent_settings.BETA, agent_settings.EXPECTILE),
         *(agent_settings.DISCOUNT, agent_settings.TARGET_RATE),
     )

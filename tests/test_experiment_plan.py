@@ -137,8 +137,8 @@ def test_sweep_arms_roll_out_one_training(tmp_path: Path) -> None:
     assert [name for name, stage in stages.items() if stage.kind == "wm_iql"] == ["seed_0/wm_iql_sweep"]
     evaluations = [stage for stage in stages.values() if stage.kind == "evaluate"]
     assert len(evaluations) == 4
-    assert "--policy.beta=3" in stages["seed_0/eval_wm_iql_beta3"].argv
-    assert not [flag for flag in stages["seed_0/eval_wm_iql"].argv if flag.startswith("--policy.beta")]
+    assert "--policy.iql.beta=3" in stages["seed_0/eval_wm_iql_beta3"].argv
+    assert not [flag for flag in stages["seed_0/eval_wm_iql"].argv if flag.startswith("--policy.iql.beta")]
 
 
 def test_without_the_sweep_its_actors_are_not_trained(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from lerobot.policies import make_pre_post_processors
 from safetensors.torch import load_file
 
 from lerobot_wm.data.latents import LatentRecord
-from lerobot_wm.policies.latent.encoder import load_encoder
+from lerobot_wm.policies.latent.policy import load_encoder
 from tests.flags import DATASET_FLAGS
 
 

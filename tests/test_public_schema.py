@@ -18,8 +18,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from safetensors.torch import load_file
 
-from lerobot_wm.policies.common.iql_agent import Outcomes
-from lerobot_wm.policies.common.rewards import FrameLabel
+from lerobot_wm.policies.common.iql import FrameColumn, IQLConfig, RewardsAndEnds
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import SMALL_WORLD_MODEL
 from tests.recording import FRONT, camera, record, train_flags, vector
@@ -73,13 +72,13 @@ def world_model_path(
 
 
 def test_labels_of_frames_are_found_by_index(dataset: LeRobotDataset) -> None:
-    success = FrameLabel("next.success", dataset.meta)
+    success = FrameColumn("next.success", dataset.meta)
     expected = torch.tensor([0.0] * 6 + [1] + [0] * 4 + [1] + [0] * 5 + [1])
     assert torch.equal(success.values, expected)
     assert not success.state_dict()
     index = torch.tensor([5, 0, 16])
     assert success({"index": index}, 3).tolist() == [[0, 1, 0], [0, 0, 0], [0, 1, 1]]
-    assert FrameLabel("next.reward", dataset.meta)({"next.reward": index}) is index
+    assert FrameColumn("next.reward", dataset.meta)({"next.reward": index}) is index
 
 
 def test_outcomes_of_sparse_and_dense_reward(dataset: LeRobotDataset) -> None:
@@ -87,7 +86,7 @@ def test_outcomes_of_sparse_and_dense_reward(dataset: LeRobotDataset) -> None:
     batch = {"index": torch.tensor([0, 6, 8]), "next.reward": torch.tensor([1.0, 7.0, 2.0])}
     batch["observation.state_is_pad"] = torch.tensor([[False, False], [False, True], [False, False]])
     for key, expected in (("next.success", [0, 1, 0]), ("next.reward", [1, 7, 2])):
-        reward, ends, goes_on = Outcomes(
+        reward, ends, goes_on = RewardsAndEnds(
             make_policy_config("e2e_iql", reward_key=key, device="cpu"), dataset.meta
         )(batch)
         assert reward.tolist() == expected
@@ -186,10 +185,12 @@ def test_where_a_task_ends_can_be_named(tmp_path: Path) -> None:
         ("next.success", [False] * 4),
         ("never", [False] * 4),
     ):
-        config = make_policy_config("e2e_iql", done_key=done_key, device="cpu")
-        assert Outcomes(config, failed.meta)(batch)[1].tolist() == expected
+        config = make_policy_config("e2e_iql", iql=IQLConfig(done_key=done_key), device="cpu")
+        assert RewardsAndEnds(config, failed.meta)(batch)[1].tolist() == expected
     with pytest.raises(ValueError, match=r"has no next\.over"):
-        Outcomes(make_policy_config("e2e_iql", done_key="next.over", device="cpu"), failed.meta)
+        RewardsAndEnds(
+            make_policy_config("e2e_iql", iql=IQLConfig(done_key="next.over"), device="cpu"), failed.meta
+        )
 
 
 def test_labels_without_tables_are_no_zeros(dataset: LeRobotDataset, tmp_path: Path) -> None:
@@ -197,4 +198,4 @@ def test_labels_without_tables_are_no_zeros(dataset: LeRobotDataset, tmp_path: P
     shutil.copytree(Path(dataset.root) / "meta", tmp_path / "meta")
     meta = LeRobotDatasetMetadata("test/streamed", root=tmp_path)
     with pytest.raises(FileNotFoundError, match=r"has no tables, and next\.success is read from them"):
-        Outcomes(make_policy_config("e2e_iql", device="cpu"), meta)
+        RewardsAndEnds(make_policy_config("e2e_iql", device="cpu"), meta)

@@ -20,7 +20,7 @@ from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
 from lerobot_wm.encode.command import encode, encode_share
 from lerobot_wm.encode.episodes import episode_batches, filter_batches
-from lerobot_wm.policies.latent.encoder import load_encoder
+from lerobot_wm.policies.latent.policy import load_encoder
 from lerobot_wm.quiet import quiet
 from lerobot_wm.system import Share
 

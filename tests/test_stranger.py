@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from torch.utils.data import DataLoader
 
 from lerobot_wm.data.loader import RamLoader
-from lerobot_wm.policies.common.cameras import camera_images
+from lerobot_wm.nn.images import camera_images
 from lerobot_wm.policies.e2e_bc.modeling_e2e_bc import E2EBCPolicy
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
@@ -114,7 +114,7 @@ def test_both_loaders_show_a_model_the_same_images(
     for batch in (theirs, ours):
         # LeRobot's training loop turns the uint8 of videos into numbers from 0 to 1; images are that already.
         as_float = {key: batch[key] if dtype == "image" else batch[key].float() / 255 for key in FRAME_SHAPES}
-        seen.append(camera_images(config, as_float))
+        seen.append(camera_images(as_float, config.cameras, config.image_size))
     assert seen[0].std() > 0.1
     assert torch.equal(*seen)
 

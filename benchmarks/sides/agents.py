@@ -23,12 +23,12 @@ def iql(folder: Path, batch: int, seconds: float) -> Prepared:
     agent = IQLAgent(
         OBSERVATION_DIM,
         ACTION_DIM,
-        betas=[config.beta],
+        betas=[config.iql.beta],
         hidden_dims=config.hidden_dims,
         dropout=config.dropout,
-        expectile=config.expectile,
-        discount=config.discount,
-        target_rate=config.target_rate,
+        expectile=config.iql.expectile,
+        discount=config.iql.discount,
+        target_rate=config.iql.target_rate,
     )
     optimizer = config.get_optimizer_preset().build(agent.param_groups())
     scheduler = config.get_scheduler_preset().build(optimizer, 1_000_000)

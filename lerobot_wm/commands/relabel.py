@@ -31,7 +31,7 @@ class RelabelConfig:
     Args:
         dataset: The dataset to copy.
         reward: The column that becomes `next.reward`, such as `next.dense_reward`. IQL on one that is above zero on the
-            way to success needs `--policy.done_key=never`.
+            way to success needs `--policy.iql.done_key=never`.
         output_repo_id: Repository id of the copy.
         output_root: Its folder; must not exist yet.
     """

@@ -29,10 +29,9 @@ from lerobot_wm.encode.shards import LatentParts
 from lerobot_wm.files import sole_writer
 from lerobot_wm.hub.dataset_card import license_of, push_latents
 from lerobot_wm.hub.errors import check_can_push
-from lerobot_wm.policies.common.checks import check_encoder_fits
-from lerobot_wm.policies.common.features import OWN_NAMES, names_before, renamed
+from lerobot_wm.policies.common.checks import OWN_NAMES, check_reads, names_before, renamed
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
-from lerobot_wm.policies.latent.encoder import EncoderPolicy, encoder_fingerprint, load_encoder
+from lerobot_wm.policies.latent.policy import EncoderPolicy, LatentPolicy, encoder_fingerprint, load_encoder
 from lerobot_wm.quiet import quiet
 from lerobot_wm.system import Share, parts_folder, refuse_difference
 
@@ -167,20 +166,14 @@ def _begin(
             if LatentRecord.read(output_root) == _record(policy, source, rename_map, sample_seed):
                 shutil.rmtree(parts, ignore_errors=True)  # left by a run killed at its very end
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
-    cameras = names_before(policy.config.cameras, rename_map)
-    missing = [key for key in cameras if key not in source.meta.camera_keys]
-    if missing:
-        raise ValueError(
-            f"The world model watches {', '.join(missing)}; {source.repo_id} has the cameras "
-            f"{', '.join(source.meta.camera_keys) or 'none'}: use a dataset with all it watches, or give these names "
-            "to cameras that show the same, by --rename_map of lerobot-wm encode."
-        )
+    # Of a policy on latents, what its world model reads.
+    model = policy.config.world_model if isinstance(policy, LatentPolicy) else policy.config
+    check_reads(model, source.meta, rename_map)
     [state] = names_before([OBS_STATE], rename_map)
     if state not in source.meta.features:
         raise ValueError(
             f"{source.repo_id} has no '{state}', which every policy on latents reads beside them."
         )
-    check_encoder_fits(policy.config, source.meta, rename_map)
     record = _record(policy, source, rename_map, sample_seed)
     names = {"rename_map": json.dumps(dict(rename_map), sort_keys=True)}
     return record, LatentParts(parts, record.made_of | names)

@@ -11,9 +11,9 @@ from torch.nn.utils.rnn import pad_sequence
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.tables import column_tensor
-from lerobot_wm.policies.common.cameras import stack_images
-from lerobot_wm.policies.common.features import OWN_NAMES, names_before
-from lerobot_wm.policies.latent.encoder import EncoderPolicy
+from lerobot_wm.nn.images import stack_images
+from lerobot_wm.policies.common.checks import OWN_NAMES, names_before
+from lerobot_wm.policies.latent.policy import EncoderPolicy
 
 _EPISODES_PER_BATCH = 16
 _FRAMES_PER_CHUNK = 512  # images per encoder call: bounds memory whatever the length of the episodes

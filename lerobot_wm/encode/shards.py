@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from lerobot_wm.constants import OBS_LATENT
 from lerobot_wm.encode.episodes import filter_batches
-from lerobot_wm.policies.latent.encoder import EncoderPolicy
+from lerobot_wm.policies.latent.policy import EncoderPolicy
 from lerobot_wm.system import refuse_difference
 
 

@@ -22,8 +22,8 @@ from lerobot_wm.constants import EVAL_INFO_NAME
 from lerobot_wm.evaluate.config import EvaluateConfig
 from lerobot_wm.evaluate.rollouts import TaskRunner, task_names
 from lerobot_wm.evaluate.wandb_log import log_evaluation, wandb_run
-from lerobot_wm.policies.common.checkpoint import check_policy_path, check_processors
-from lerobot_wm.policies.common.multi_task_config import MultiTaskConfig
+from lerobot_wm.policies.common.checkpoint import open_checkpoint
+from lerobot_wm.policies.common.config import PolicyConfig
 from lerobot_wm.quiet import drop_remarks
 from lerobot_wm.records import (
     Record,
@@ -80,8 +80,8 @@ def evaluate(cfg: EvaluateConfig) -> list[Record]:
 
 
 def _evaluate(cfg: EvaluateConfig) -> list[Record]:
-    check_processors(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
-    if isinstance(cfg.policy, MultiTaskConfig):  # small: a broken one is found before environments are built
+    open_checkpoint(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
+    if isinstance(cfg.policy, PolicyConfig):  # small: a broken one is found before environments are built
         make_policy(deepcopy(cfg.policy), env_cfg=cfg.env, rename_map=cfg.rename_map)
     tasks = task_names(cfg)
     revision = cfg.policy.pretrained_revision
@@ -144,5 +144,7 @@ def _evaluate_from_command_line(cfg: EvaluateConfig) -> None:
 def main() -> None:
     """Entry point of `lerobot-wm eval`."""
     init_logging()
-    check_policy_path()
+    path = parser.get_path_arg("policy")
+    if path:  # before LeRobot's parser reads it, which would show a traceback
+        open_checkpoint(path, parser.parse_arg("policy.pretrained_revision"))
     _evaluate_from_command_line()  # type: ignore[call-arg]

@@ -10,7 +10,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_wm.constants import RECORDS_NAME
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.variations import is_seen, split_variations
-from lerobot_wm.policies.common.checks import check_environment_fits
+from lerobot_wm.policies.common.checks import check_fit
 from lerobot_wm.policies.latent.config import LatentPolicyConfig
 
 
@@ -75,7 +75,7 @@ class EvaluateConfig(EvalPipelineConfig):
             raise ValueError(
                 f"--policy.type={self.policy.type} alone would be untrained: give --policy.path=CHECKPOINT."
             )
-        check_environment_fits(self.policy, self.env, self.rename_map)
+        check_fit(self.policy, self.env, self.rename_map)
 
     @property
     def records_file(self) -> Path:

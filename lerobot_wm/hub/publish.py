@@ -13,17 +13,15 @@ from huggingface_hub import CommitOperationAdd, HfApi
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.policies.factory import get_policy_class
 from PIL import Image
 
 from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.source import dataset_folder
 from lerobot_wm.hub.errors import check_can_push
-from lerobot_wm.hub.model_card import IMAGINATION, TrainingData, model_card
-from lerobot_wm.inspect.episodes import check_features, load_world_model
+from lerobot_wm.inspect.episodes import CheckpointConfig, check_features, load_world_model
 from lerobot_wm.inspect.open_loop import CONTEXT, OpenLoop, open_loop, psnr_table
 from lerobot_wm.markdown import escaped
-from lerobot_wm.policies.world_model.config import WorldModelConfig
+from lerobot_wm.policies.common.card import IMAGINATION, TrainingData, model_card
 from lerobot_wm.records import Record, find_records, read_records
 from lerobot_wm.tables import ReportTable, markdown_table, table_by_split
 
@@ -62,22 +60,11 @@ def _column(result: OpenLoop) -> np.ndarray:
 
 
 @dataclass
-class CheckpointFolder:
-    """`--policy.path`, a folder.
-
-    Args:
-        path: `.../checkpoints/last/pretrained_model`.
-    """
-
-    path: Path
-
-
-@dataclass
 class PublishConfig:
     """Flags of `lerobot-wm publish`.
 
     Args:
-        policy: The checkpoint.
+        policy: The checkpoint's folder, `.../checkpoints/last/pretrained_model`.
         repo_id: The repository, as user/name; files that are there already and have not changed are not sent again.
         records: Records of `lerobot-wm eval` of this checkpoint, for the card's table; None for no table.
         dataset: An image dataset; the card shows an episode of each task and how the world model imagines it. None for
@@ -85,7 +72,7 @@ class PublishConfig:
         private: Make a new repository private.
     """
 
-    policy: CheckpointFolder
+    policy: CheckpointConfig
     repo_id: str
     records: str | None = None
     dataset: SourceConfig | None = None
@@ -103,7 +90,7 @@ def publish(cfg: PublishConfig) -> str:
         ValueError: The records are of another policy, the checkpoint holds no world model, or the dataset lacks what it
             reads.
     """
-    folder = cfg.policy.path
+    folder = Path(cfg.policy.path)
     if not (folder / TRAIN_CONFIG_NAME).is_file():
         raise FileNotFoundError(
             f"{folder} holds no {TRAIN_CONFIG_NAME}, so it is not a checkpoint of a training run. Give "
@@ -132,15 +119,12 @@ def publish(cfg: PublishConfig) -> str:
             tables.append(psnr_table(predictions))
     results = "".join(map(_section, tables)) or None
     card = model_card(
-        get_policy_class(config.type),
         config,
         cfg.repo_id,
         run,
         _training_data(run),
         results,
         tasks,
-        features_read=config.features_read,
-        makes_latents=isinstance(config, WorldModelConfig),
     )
     files["README.md"] = str(card).encode()
     return _upload(files, cfg.repo_id, cfg.private)

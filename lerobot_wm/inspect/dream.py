@@ -18,7 +18,7 @@ from torch import Tensor
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, TASK
 from lerobot_wm.inspect.episodes import ImaginingPolicy, filter_frames, reward_key, rssm_of, stack_episodes
 from lerobot_wm.inspect.open_loop import psnr
-from lerobot_wm.policies.common.cameras import camera_images
+from lerobot_wm.nn.images import camera_images
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.world_model.rssm import RSSMState
 
@@ -123,7 +123,7 @@ def dream(policy: ImaginingPolicy, episode: dict[str, Any], context: int) -> Dre
     return Dreams(
         context=context,
         n_cameras=len(policy.config.cameras),
-        truth=camera_images(policy.config, batch)[0].cpu(),
+        truth=camera_images(batch, policy.config.cameras, policy.config.image_size)[0].cpu(),
         # next.success is stored as bool.
         reward=episode[key].float() if key in episode else None,
         reward_key=key,

@@ -11,7 +11,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.evaluate.wandb_log import wandb_run
 from lerobot_wm.inspect.dream import Dreams, dream, strip_figure, write_dream
-from lerobot_wm.inspect.episodes import check_features, load_world_model, read_episodes
+from lerobot_wm.inspect.episodes import CheckpointConfig, check_features, load_world_model, read_episodes
 from lerobot_wm.inspect.open_loop import CONTEXT
 from lerobot_wm.inspect.pictures import PNG, figure_bytes
 from lerobot_wm.policies.common.checkpoint import split_revision
@@ -19,13 +19,6 @@ from lerobot_wm.quiet import quiet, silence
 
 if TYPE_CHECKING:  # wandb takes seconds to import
     import wandb
-
-
-@dataclass
-class CheckpointConfig:
-    """`--policy.path`, as in `lerobot-eval`."""
-
-    path: str
 
 
 @dataclass

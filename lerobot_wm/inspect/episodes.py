@@ -1,6 +1,7 @@
 """World models that imagine images, and the episodes of image datasets that they are shown."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,10 +11,8 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
 from lerobot_wm.data.options import SourceConfig
-from lerobot_wm.nn.images import resize_images
-from lerobot_wm.policies.common.cameras import camera_images
-from lerobot_wm.policies.latent.encoder import load_encoder
-from lerobot_wm.policies.latent.policy import LatentPolicy
+from lerobot_wm.nn.images import camera_images, resize_images
+from lerobot_wm.policies.latent.policy import LatentPolicy, load_encoder
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.model import WorldModel
@@ -23,6 +22,13 @@ from lerobot_wm.world_model.rssm import RSSMState
 _FRAMES_AT_ONCE = 64
 
 type ImaginingPolicy = WMRSSMPolicy | LatentPolicy
+
+
+@dataclass
+class CheckpointConfig:
+    """`--policy.path`, as in `lerobot-eval`."""
+
+    path: str
 
 
 def load_world_model(path: str) -> ImaginingPolicy:
@@ -161,4 +167,6 @@ def filter_frames(
     frames = {key: value[:, :n_frames] for key, value in batch.items()}
     world_model = rssm_of(policy)
     proprio = frames[OBS_STATE] if world_model.config.use_proprio else None
-    return world_model.filter(camera_images(policy.config, frames), frames[ACTION], proprio)
+    return world_model.filter(
+        camera_images(frames, policy.config.cameras, policy.config.image_size), frames[ACTION], proprio
+    )

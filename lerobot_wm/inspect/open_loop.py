@@ -23,7 +23,7 @@ from lerobot_wm.inspect.episodes import (
     rssm_of,
     stack_episodes,
 )
-from lerobot_wm.policies.common.cameras import camera_images, side_by_side
+from lerobot_wm.nn.images import camera_images, side_by_side
 from lerobot_wm.tables import Measurement, ReportTable
 
 logger = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ def predict(policy: ImaginingPolicy, task: str, windows: list[dict[str, Any]]) -
     """
     world_model, n_cameras = rssm_of(policy), len(policy.config.cameras)
     batch = stack_episodes(policy, windows)
-    images = camera_images(policy.config, batch)  # (B, T, C, 64, 64)
+    images = camera_images(batch, policy.config.cameras, policy.config.image_size)  # (B, T, C, 64, 64)
     context = filter_frames(policy, batch, CONTEXT)
     # The action executed at the last frame seen leads to the first imagined one.
     states = world_model.imagine(context.last(), batch[ACTION][:, CONTEXT - 1 : -1])

@@ -26,7 +26,7 @@ from lerobot_wm.inspect.quality_measures import (
     summarise,
 )
 from lerobot_wm.inspect.quality_probes import FRAMES_PER_EPISODE, draw_frames, probe_positions, probe_task
-from lerobot_wm.policies.common.cameras import side_by_side
+from lerobot_wm.nn.images import side_by_side
 from lerobot_wm.records import provenance
 from lerobot_wm.world_model.model import WorldModel
 

@@ -15,7 +15,7 @@ from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.tables import column_tensor
 from lerobot_wm.nn.conv import IMAGE_SIZE
-from lerobot_wm.policies.common.cameras import stack_images
+from lerobot_wm.nn.images import stack_images
 from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import RSSMState
 

@@ -1,4 +1,6 @@
-"""Operations on images: random shifts and resizing."""
+"""Operations on images: random shifts, resizing, and stacking of several cameras."""
+
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -44,3 +46,19 @@ def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
         return images
     resized = F.interpolate(images.flatten(0, -4), size=size, mode="bilinear", antialias=True)
     return ((resized * _LEVELS).round() / _LEVELS).unflatten(0, images.shape[:-3])
+
+
+def stack_images(images: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+    """Resize each camera's images (..., C, H, W) and stack them along channels: (..., K·C, *size)."""
+    resized = [resize_images(image, size) for image in images]
+    return resized[0] if len(resized) == 1 else torch.cat(resized, dim=-3)  # cat would copy a single one
+
+
+def camera_images(batch: Mapping[str, Tensor], cameras: Sequence[str], size: tuple[int, int]) -> Tensor:
+    """The images (..., C, H, W) in [0, 1] of K cameras of a batch, resized and stacked: (..., K·C, *size)."""
+    return stack_images([batch[key] for key in cameras], size)
+
+
+def side_by_side(images: Tensor, n_cameras: int) -> Tensor:
+    """Stacked images (..., K·C, H, W) of K cameras as one wide picture each, to look at: (..., C, H, K·W)."""
+    return torch.cat(images.chunk(n_cameras, dim=-3), dim=-1)

@@ -80,9 +80,9 @@ class Arm:
 
 # Inverse temperatures of the sweep. Their actors are trained beside that of wm_iql (beta 0.5), on the same critics.
 SWEEP_BETAS = (0, 3, 10)
-_SWEEP_FLAG = f"--policy.sweep_betas=[{','.join(map(str, SWEEP_BETAS))}]"
+_SWEEP_FLAG = f"--policy.iql.sweep_betas=[{','.join(map(str, SWEEP_BETAS))}]"
 # If success ended the return, a dense reward would teach the policy to put success off.
-_NO_END = ("--policy.done_key=never",)
+_NO_END = ("--policy.iql.done_key=never",)
 
 _WM_IQL = Arm(
     "wm_iql", "IQL on latents of the world model, one policy for all tasks, β 0.5", "wm_iql", WM_RSSM
@@ -97,7 +97,7 @@ def _in_sweep(beta: int, description: str) -> Arm:
         WM_IQL_IN_SWEEP,
         name=f"wm_iql_beta{beta}",
         description=description,
-        eval_flags=(f"--policy.beta={beta}",),
+        eval_flags=(f"--policy.iql.beta={beta}",),
     )
 
 

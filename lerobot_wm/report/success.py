@@ -153,8 +153,9 @@ def _task_cells(records: list[Record], tasks: list[str] | tuple[str, ...]) -> li
 
 def _bootstrap_notes(single: list[str], n_arms: int) -> list[str]:
     notes = [
-        "Seen, unseen, all: rollouts pooled, [Wilson 95%]. Mean and IQM (mean of the middle half) are over the success "
-        f"rates of seeds x tasks, [95% stratified bootstrap, {N_RESAMPLES:,} resamples]."
+        "Seen, unseen, all: success over all rollouts, with [Wilson 95% intervals]. Mean and IQM (mean of the middle "
+        "half): over the success rates of all seeds and tasks, with [95% stratified bootstrap intervals, "
+        f"{N_RESAMPLES:,} resamples]."
     ]
     if len(single) < n_arms:
         notes.append(
@@ -164,8 +165,8 @@ def _bootstrap_notes(single: list[str], n_arms: int) -> list[str]:
         )
     if single:
         notes.append(
-            f"Arms with one seed ({', '.join(single)}): its variations are resampled within each task, so the interval "
-            "covers the choice of variations, not training seeds."
+            f"Arms with one seed ({', '.join(single)}): their variations are resampled within each task, so the "
+            "interval covers the choice of variations, not training seeds."
         )
     return notes
 

@@ -21,7 +21,7 @@ from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.inspect.episodes import episodes_by_task
 from lerobot_wm.inspect.pictures import WEBP, data_uri, shorten
-from lerobot_wm.policies.common.rewards import reward_columns
+from lerobot_wm.policies.common.iql import reward_columns
 
 # Of the first frames shown, in pixels.
 MAX_PICTURE_SIZE = 256

@@ -17,10 +17,9 @@ from lerobot_wm.data.check import check_dataset, damage_named
 from lerobot_wm.encode.command import LATENTS_PREFIX, encode_to_cache
 from lerobot_wm.files import sole_writer
 from lerobot_wm.hub.errors import check_can_push, check_dataset_version
-from lerobot_wm.policies.common.cameras import ImagePolicyConfig
-from lerobot_wm.policies.common.checkpoint import check_policy_path, check_processors, read_config
-from lerobot_wm.policies.common.checks import check_dataset_fits
-from lerobot_wm.policies.common.fine_tuning import names_given_by
+from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config
+from lerobot_wm.policies.common.checks import check_fit, names_given_by
+from lerobot_wm.policies.common.config import PolicyConfig
 from lerobot_wm.policies.latent.config import LatentPolicyConfig
 from lerobot_wm.system import keep_freed_memory
 from lerobot_wm.train.resume import clear_unfinished, explain_how_to_resume, restore_last
@@ -57,10 +56,10 @@ def encode_if_needed(cfg: TrainPipelineConfig) -> None:
         ValueError: The policy and the dataset do not fit; nothing was encoded.
     """
     policy = cfg.policy
-    if not isinstance(policy, ImagePolicyConfig):
+    if not isinstance(policy, PolicyConfig):
         return
     meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
-    check_dataset_fits(policy, meta, cfg.rename_map)
+    check_fit(policy, meta, cfg.rename_map)
     if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent or OBS_LATENT in meta.features:
         return
     encoder = policy.world_model_path
@@ -114,7 +113,7 @@ def train(cfg: TrainPipelineConfig) -> None:
             "models, --dataset.streaming=true and --job.target use lerobot-train."
         )
     if cfg.policy.pretrained_path is not None:
-        check_processors(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
+        open_checkpoint(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
         if cfg.policy.push_to_hub and not cfg.resume:
             check_base_is_kept(cfg.policy)
     processes = start_processes(cfg.policy)
@@ -146,6 +145,8 @@ def main() -> None:
     config_path = parser.parse_arg("config_path")
     if config_path is not None:
         restore_last(Path(config_path))
-    check_policy_path()
+    path = parser.get_path_arg("policy")
+    if path:  # before LeRobot's parser reads it, which would show a traceback
+        open_checkpoint(path, parser.parse_arg("policy.pretrained_revision"))
     keep_freed_memory()
     train()

@@ -18,9 +18,8 @@ from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
 from lerobot_wm.data.loader import RamLoader, batches_of_rows
-from lerobot_wm.policies.common.cameras import ImagePolicyConfig
-from lerobot_wm.policies.common.checks import check_environment_fits
-from lerobot_wm.policies.common.features import names_before
+from lerobot_wm.policies.common.checks import check_fit, names_before
+from lerobot_wm.policies.common.config import PolicyConfig
 
 # How long processes wait for the one that decodes or encodes. The default is minutes.
 _PATIENCE = timedelta(days=1)
@@ -31,7 +30,7 @@ def train_from_memory(cfg: TrainPipelineConfig) -> None:
     if not hasattr(lerobot_train, "make_dataloaders"):  # LeRobot 0.6.1
         lerobot_train.train(cfg, accelerator=_make_accelerator(cfg))
         return
-    if isinstance(cfg.policy, ImagePolicyConfig):  # on LeRobot 0.6.1 a policy's dtype decides
+    if isinstance(cfg.policy, PolicyConfig):  # on LeRobot 0.6.1 a policy's dtype decides
         cfg.accelerator.mixed_precision = _mixed_precision(cfg.policy)
     make_dataloaders = lerobot_train.make_dataloaders
 
@@ -76,7 +75,7 @@ def cameras_to_serve(cfg: TrainPipelineConfig) -> dict[str, tuple[int, int]] | N
     None, all of them as they are, where the policy is not one of ours.
     """
     policy = cfg.policy
-    if not isinstance(policy, ImagePolicyConfig):
+    if not isinstance(policy, PolicyConfig):
         return None
     cameras = names_before(policy.cameras, cfg.rename_map)
     return dict.fromkeys(cameras, policy.image_size) if cameras else {}  # without one there is no size
@@ -107,7 +106,7 @@ def _make_accelerator(cfg: TrainPipelineConfig) -> Accelerator:
     """As LeRobot 0.6.1 makes it, but for the data loaders."""
     # Buffers of our policies are alike in all processes: one of a number per frame of the dataset would be sent around
     # at every step.
-    buffers_differ = not isinstance(cfg.policy, ImagePolicyConfig)
+    buffers_differ = not isinstance(cfg.policy, PolicyConfig)
     return _RamAccelerator(
         cfg,
         step_scheduler_with_optimizer=False,
@@ -129,4 +128,4 @@ def _mixed_precision(policy: PreTrainedConfig) -> str | None:
 def _check_environment(cfg: TrainPipelineConfig) -> None:
     # LeRobot has made the policy by now. Without this the run would stop at its first evaluation.
     if cfg.env is not None and cfg.env_eval_freq > 0:
-        check_environment_fits(cfg.policy, cfg.env, cfg.rename_map)
+        check_fit(cfg.policy, cfg.env, cfg.rename_map)

@@ -21,7 +21,7 @@ from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.envs.variations import rand_vec
 from lerobot_wm.evaluate.config import variation_of
-from lerobot_wm.policies.latent.encoder import load_encoder
+from lerobot_wm.policies.latent.policy import load_encoder
 from lerobot_wm.quiet import quiet
 from lerobot_wm.records import Record, read_records
 from tests.faults.running import Inputs

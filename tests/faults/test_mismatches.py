@@ -15,7 +15,8 @@ from lerobot_wm.data.latents import RECORD_PATH
 from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.encode.command import encode
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from lerobot_wm.hub.publish import CheckpointFolder, PublishConfig, publish
+from lerobot_wm.hub.publish import PublishConfig, publish
+from lerobot_wm.inspect.episodes import CheckpointConfig
 from tests.faults.breakage import set_entry
 from tests.faults.checkpoints import TASKS, WEIGHTS, last_line, load, make_checkpoint, record_demos
 from tests.flags import TRAIN_FLAGS
@@ -265,7 +266,7 @@ def test_a_card_cannot_show_a_dataset_that_the_world_model_does_not_read(
     TrainPipelineConfig(DatasetConfig("test/demos"), policy=policy).save_pretrained(folder)
     source = SourceConfig("test/cameras", str(datasets["cameras"].root))
     with pytest.raises(ValueError, match=r"test/cameras has no observation\.image; it has"):
-        publish(PublishConfig(CheckpointFolder(folder), "user/wm", dataset=source))
+        publish(PublishConfig(CheckpointConfig(str(folder)), "user/wm", dataset=source))
 
 
 def test_the_order_of_tasks_is_the_checkpoints(

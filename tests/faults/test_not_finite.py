@@ -11,6 +11,7 @@ import pytest
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_policy
 
 from lerobot_wm.collect.shards import Shard, write_shard
 from lerobot_wm.data.loader import RamDataset
@@ -145,9 +146,9 @@ def test_advice_on_divergence_names_flags_of_the_policy(
 
 def test_weights_that_are_not_finite_are_not_saved(dataset: Path, tmp_path: Path) -> None:
     """A gradient can be infinite where the loss is finite."""
-    policy = WMRSSMPolicy(
+    policy = make_policy(
         WMRSSMConfig(device="cpu", rssm=RSSMConfig(deter_dim=16, stoch_dim=8, hidden_dim=16)),
-        dataset_meta=LeRobotDatasetMetadata("test/faults", root=dataset),
+        ds_meta=LeRobotDatasetMetadata("test/faults", root=dataset),
     )
     check_finite_weights(policy, policy.config)
     name, weight = next(iter(policy.named_parameters()))

@@ -10,9 +10,9 @@ from markdown_it import MarkdownIt
 
 from lerobot_wm.constants import MT6
 from lerobot_wm.envs.tasks import task_description
-from lerobot_wm.hub.model_card import TrainingData, eval_command, model_card
 from lerobot_wm.hub.publish import check_records
 from lerobot_wm.markdown import code, escaped
+from lerobot_wm.policies.common.card import TrainingData, eval_command, model_card
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig

@@ -8,8 +8,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
-from lerobot_wm.policies.common.action_noise import ActionNoise
-from lerobot_wm.policies.common.multi_task_policy import MultiTaskPolicy
+from lerobot_wm.policies.common.policy import ActingPolicy, ActionNoise
 
 STD = 0.3
 
@@ -44,7 +43,7 @@ def test_noise_is_gaussian_with_the_given_deviation() -> None:
     assert correlation.abs().max() < 0.08
 
 
-def load(path: Path, policy_type: str, std: float) -> MultiTaskPolicy:
+def load(path: Path, policy_type: str, std: float) -> ActingPolicy:
     config = PreTrainedConfig.from_pretrained(path)
     config.action_noise = std
     return get_policy_class(policy_type).from_pretrained(path, config=config)

@@ -6,8 +6,8 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_wm.nn.images import resize_images
-from lerobot_wm.policies.common.cameras import camera_images, check_observation, side_by_side, stack_images
+from lerobot_wm.nn.images import camera_images, resize_images, side_by_side, stack_images
+from lerobot_wm.policies.common.policy import check_observation
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.config import RSSMConfig
@@ -44,7 +44,7 @@ def test_cameras_are_stacked_in_the_order_given(image_key: str | None, cameras: 
     assert config.cameras == cameras
     assert config.rssm.image_channels == 3 * len(cameras)
     batch = {LEFT: torch.rand(2, 5, 3, 64, 64), RIGHT: torch.rand(2, 5, 3, 48, 96)}
-    images = camera_images(config, batch)
+    images = camera_images(batch, config.cameras, config.image_size)
     assert images.shape == (2, 5, 3 * len(cameras), 64, 64)
     for key, image in zip(cameras, images.split(3, dim=2), strict=True):
         assert torch.equal(image, resize_images(batch[key], (64, 64)))
@@ -77,18 +77,22 @@ def test_each_camera_is_reconstructed_and_matters_to_the_latent() -> None:
     assert bool((by_channel != 0).all())
     with torch.no_grad():
         model, actions = policy.world_model, batch["action"]
-        latent = model.filter(camera_images(policy.config, batch), actions).latent
+        latent = model.filter(
+            camera_images(batch, policy.config.cameras, policy.config.image_size), actions
+        ).latent
         for key in (LEFT, RIGHT):
-            other = camera_images(policy.config, {**batch, key: 1 - batch[key]})
+            other = camera_images(
+                {**batch, key: 1 - batch[key]}, policy.config.cameras, policy.config.image_size
+            )
             assert not torch.allclose(latent, model.filter(other, actions).latent), key
 
 
 @pytest.mark.parametrize(
     ("image_key", "right", "message"),
     [
-        ("observation.image", (3, 48, 96), r"image_key is 'observation\.image'.*left, .*right\. wm_rssm"),
-        (f"{LEFT},{LEFT}", (3, 48, 96), r"each once"),
-        (None, (1, 48, 96), r"numbers of channels.*left': 3, .*right': 1.*--policy\.image_key"),
+        ("observation.image", (3, 48, 96), r"image_key is 'observation\.image'.*left, .*right\."),
+        (f"{LEFT},{LEFT}", (3, 48, 96), rf"image_key is '{LEFT},{LEFT}'"),
+        (None, (1, 48, 96), r"left': 3, .*right': 1.*--policy\.image_key"),
     ],
 )
 def test_wrong_choices_are_refused(image_key: str | None, right: tuple[int, int, int], message: str) -> None:
@@ -104,11 +108,9 @@ def test_what_is_shown_is_checked_camera_by_camera() -> None:
     with pytest.raises(ValueError, match=r"right' is \(3, 64, 64\).*\(3, 48, 96\)"):
         check_observation(config, {LEFT: left, RIGHT: left})
     with pytest.raises(
-        ValueError, match=r"right'; the observation has observation\.images\.left\. .*rename_map"
+        ValueError, match=r"right; the observation has observation\.images\.left\. .*rename_map"
     ):
         check_observation(config, {LEFT: left})
-    with pytest.raises(ValueError, match=r"right'; the observation has observation\.images\.left\."):
-        camera_images(config, {LEFT: left[:, None], f"{LEFT}_is_pad": left})
 
 
 @pytest.mark.parametrize("scale", [torch.uint8, torch.float32])
@@ -117,5 +119,5 @@ def test_bytes_of_a_camera_are_refused(scale: torch.dtype) -> None:
     config = make_config()
     config.validate_features()
     shown = {LEFT: torch.ones(1, 3, 64, 64), RIGHT: torch.full((1, 3, 48, 96), 200).to(scale)}
-    with pytest.raises(ValueError, match=rf"right' is {scale} up to 200; expected .* \[0, 1\]: divide"):
+    with pytest.raises(ValueError, match=rf"right' is {scale} .* 200; expected .* \[0, 1\]"):
         check_observation(config, shown)

@@ -22,8 +22,7 @@ from lerobot_wm.encode.command import encode_to_cache
 from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone, load_backbone_weights
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
 from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy
-from lerobot_wm.policies.latent.encoder import encoder_fingerprint, load_encoder
-from lerobot_wm.policies.latent.setup import check_latents
+from lerobot_wm.policies.latent.policy import encoder_fingerprint, load_encoder
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 from tests.recording import FRONT, WRIST, camera, record, vector
 
@@ -111,10 +110,10 @@ def test_features_without_signal_are_refused(features_root: Path, policy_path: P
     """A MobileNet with random weights gives features of 1e-10: a policy on them would be blind, unnoticed."""
     config = PreTrainedConfig.from_pretrained(policy_path)
     meta = LeRobotDatasetMetadata("test/features", root=features_root)
-    check_latents(config, meta)
+    config.check_latents(meta)
     meta.stats["observation.latent"]["std"] *= 1e-8
     with pytest.raises(ValueError, match=r"latents of .* hardly vary.*weights_path"):
-        check_latents(config, meta)
+        config.check_latents(meta)
 
 
 def test_checkpoint_is_self_contained(

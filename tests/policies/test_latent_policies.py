@@ -18,8 +18,8 @@ from torch import Tensor
 from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.encode.command import encode_to_cache
+from lerobot_wm.policies.common.iql import IQLConfig
 from lerobot_wm.policies.latent.policy import LatentPolicy
-from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
@@ -126,10 +126,8 @@ def test_the_heads_alone_are_switched_to_training(policy_type: str, policy_paths
     policy = load(policy_paths, policy_type)
     for mode in (True, False):
         policy.train(mode)
-        modes = {name.split(".")[0]: module.training for name, module in policy.named_modules() if name}
         assert policy.training == mode
-        assert modes.pop("world_model") is False
-        assert set(modes.values()) == {mode}
+        assert {module.training for module in policy.modules()} == {mode}
     assert not any(module.training for module in policy.train().world_model.modules())
 
 
@@ -173,9 +171,28 @@ def test_actions_do_not_depend_on_the_batch(
 def test_only_the_policys_own_networks_are_trained(policy_paths: dict[str, Path]) -> None:
     for policy_type in POLICY_TYPES:
         policy = load(policy_paths, policy_type)
-        assert not any(
-            name.startswith("world_model") for name, p in policy.named_parameters() if p.requires_grad
-        )
+        assert not any(p.requires_grad for p in policy.world_model.parameters())
+        frozen = set(policy.world_model.modules())
+        assert not frozen & set(policy.modules())
+        assert not any(name.startswith("world_model") for name, _ in policy.named_parameters())
+
+
+@pytest.mark.parametrize("policy_type", POLICY_TYPES)
+def test_the_frozen_world_model_is_saved_copied_and_moved_though_no_walk_meets_it(
+    policy_type: str, policy_paths: dict[str, Path], tmp_path: Path
+) -> None:
+    policy = load(policy_paths, policy_type).train()
+    names = {name for name in policy.state_dict() if name.startswith("world_model.")}
+    assert names == {f"world_model.{name}" for name in policy.world_model.state_dict()}
+    policy.save_pretrained(tmp_path)
+    assert load_file(tmp_path / "model.safetensors").keys() == policy.state_dict().keys()
+    copy = deepcopy(policy)
+    assert copy.world_model is not policy.world_model
+    assert not set(copy.world_model.modules()) & set(copy.modules())
+    for name, tensor in policy.state_dict().items():
+        assert torch.equal(copy.state_dict()[name], tensor), name
+    copy.to("meta")
+    assert {tensor.device.type for tensor in copy.state_dict().values()} == {"meta"}
 
 
 def test_iql_targets_follow_the_critics(policy_paths: dict[str, Path]) -> None:
@@ -187,7 +204,7 @@ def test_iql_targets_follow_the_critics(policy_paths: dict[str, Path]) -> None:
     before = [target.clone() for target, _ in pairs]
     policy.update()
     for old, (target, source) in zip(before, pairs, strict=True):
-        torch.testing.assert_close(target, old + policy.config.target_rate * (source - old))
+        torch.testing.assert_close(target, old + policy.config.iql.target_rate * (source - old))
 
 
 def test_training_on_images_encodes_them_first(
@@ -438,5 +455,5 @@ def test_a_policy_left_in_training_mode_acts_without_dropout(
     [{"expectile": 1.7}, {"discount": 5.0}, {"target_rate": 0.0}, {"beta": -3.0}, {"sweep_betas": [-1.0]}],
 )
 def test_settings_that_invert_a_loss_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(wrong)).removeprefix('sweep_').rstrip('s')} is"):
-        WMIQLConfig(**wrong)
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        IQLConfig(**wrong)

@@ -6,7 +6,6 @@ from typing import Any
 
 import draccus
 import pytest
-import torch
 from draccus.utils import DecodingError
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
@@ -99,18 +98,3 @@ def test_a_policy_scales_the_latents_of_those_that_ask_for_it() -> None:
     for world_model in world_models():
         names = {name.split(".")[0] for name in WMBCPolicy(policy_config(world_model)).state_dict()}
         assert ("latent_scaling" in names) == world_model.scales_latents
-
-
-def test_release_0_1_0_on_a_backbone(tmp_path: Path) -> None:
-    """tests/policies/checkpoints_0_1_0.json has the RSSM's."""
-    policy_config(world_models()[1]).save_pretrained(tmp_path)
-    path = tmp_path / "config.json"
-    old = json.loads(path.read_text())
-    del old["world_model"]
-    old["frozen_backbone"] = {"name": "resnet18", "image_size": 32, "n_cameras": 1, "latent_dim": 512}
-    path.write_text(json.dumps(old))
-    config = PreTrainedConfig.from_pretrained(tmp_path)
-    assert draccus.encode(config) == draccus.encode(policy_config(world_models()[1]))
-    policy = WMBCPolicy(config).eval()
-    frame = {OBS_IMAGE: torch.rand(1, 3, 64, 64), OBS_STATE: torch.zeros(1, 4)}
-    assert policy.select_action(frame).shape == (1, 2)

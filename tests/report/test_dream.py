@@ -28,8 +28,8 @@ from lerobot_wm.inspect.dream import (
     strip_figure,
     video_frames,
 )
-from lerobot_wm.inspect.dream_command import CheckpointConfig, DreamConfig, dream_of
-from lerobot_wm.inspect.episodes import load_world_model, read_episodes, reward_key
+from lerobot_wm.inspect.dream_command import DreamConfig, dream_of
+from lerobot_wm.inspect.episodes import CheckpointConfig, load_world_model, read_episodes, reward_key
 from lerobot_wm.nn.images import resize_images
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig

@@ -3,7 +3,6 @@
 import json
 import logging
 import shutil
-import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from lerobot_wm.data.options import SourceConfig
 from lerobot_wm.inspect import quality
 from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.report.page import template_environment
@@ -40,11 +40,6 @@ class Section(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         self.text += " ".join(data.split()) + " "
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *flags: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["lerobot-wm quality", *flags])
-    quality.main()
 
 
 def test_by_cross_validation(quality_path: Path, tmp_path: Path) -> None:
@@ -87,19 +82,17 @@ def test_fitted_on_the_training_data(
     demos_root: Path,
     world_model_path: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with caplog.at_level(logging.WARNING):
-        run(
-            monkeypatch,
-            f"--world_model_path={world_model_path}",
-            "--dataset.repo_id=test/demos",
-            f"--dataset.root={demos_root}",
-            "--train_dataset.repo_id=test/demos",
-            f"--train_dataset.root={demos_root}",
-            f"--output_dir={tmp_path}",
-            "--episodes_per_task=2",
+        quality.quality(
+            quality.QualityConfig(
+                str(world_model_path),
+                SourceConfig("test/demos", str(demos_root)),
+                tmp_path,
+                SourceConfig("test/demos", str(demos_root)),
+                episodes_per_task=2,
+            )
         )
     assert "4 of 4 episodes" in caplog.text
     assert json.loads((tmp_path / "quality.json").read_text())["n_episodes_of_seen_positions"] == 4
@@ -122,18 +115,16 @@ def test_tasks_of_the_training_data_alone_are_left_out(
     reach_root: Path,
     world_model_path: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with caplog.at_level(logging.WARNING):
-        run(
-            monkeypatch,
-            f"--world_model_path={world_model_path}",
-            "--dataset.repo_id=test/reach",
-            f"--dataset.root={reach_root}",
-            "--train_dataset.repo_id=test/demos",
-            f"--train_dataset.root={demos_root}",
-            f"--output_dir={tmp_path}",
+        quality.quality(
+            quality.QualityConfig(
+                str(world_model_path),
+                SourceConfig("test/reach", str(reach_root)),
+                tmp_path,
+                SourceConfig("test/demos", str(demos_root)),
+            )
         )
     assert "Push and close a window" in caplog.text
     result = json.loads((tmp_path / "quality.json").read_text())
@@ -146,18 +137,16 @@ def test_tasks_without_training_data_are_refused(
     reach_root: Path,
     world_model_path: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     message = r"test/reach.*Push and close a window.*Reach a goal position.*--train_dataset"
     with pytest.raises(ValueError, match=message):
-        run(
-            monkeypatch,
-            f"--world_model_path={world_model_path}",
-            "--dataset.repo_id=test/demos",
-            f"--dataset.root={demos_root}",
-            "--train_dataset.repo_id=test/reach",
-            f"--train_dataset.root={reach_root}",
-            f"--output_dir={tmp_path / 'out'}",
+        quality.quality(
+            quality.QualityConfig(
+                str(world_model_path),
+                SourceConfig("test/demos", str(demos_root)),
+                tmp_path / "out",
+                SourceConfig("test/reach", str(reach_root)),
+            )
         )
     assert not (tmp_path / "out").exists()
 

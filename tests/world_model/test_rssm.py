@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_wm.policies.common.features import default_dtype
+from lerobot_wm.policies.common.config import default_dtype
 from lerobot_wm.world_model.config import RSSMConfig
 from lerobot_wm.world_model.losses import reconstruction_loss, world_model_loss
 from lerobot_wm.world_model.model import WorldModel

@@ -1,138 +1,188 @@
-"""What must fit before work starts: a policy, and the dataset or environment it is to be used with."""
+"""Whether a policy fits the dataset it is trained on or the environment it acts in, checked before work starts."""
 
-from collections.abc import Collection, Mapping
-from copy import deepcopy
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from types import MappingProxyType
 
-import torch
-from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.utils import STATS_PATH
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.policies.factory import get_policy_class
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import ACTION, OBS_LATENT
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.tasks import resolve_tasks, task_description
-from lerobot_wm.policies.common.cameras import ImagePolicyConfig, check_observation
-from lerobot_wm.policies.common.checkpoint import read_config
-from lerobot_wm.policies.common.features import names_before, renamed
-from lerobot_wm.policies.common.fine_tuning import (
-    check_kept,
-    check_networks,
-    check_sizes,
-    fit_to_dataset,
-    names_given_by,
+from lerobot_wm.policies.common.config import (
+    PolicyConfig,
+    check_cameras_present,
+    check_tasks,
+    image_keys,
+    train_new,
 )
-from lerobot_wm.policies.common.iql_agent import end_column
-from lerobot_wm.policies.common.iql_config import IQLConfig
-from lerobot_wm.policies.common.multi_task_config import MultiTaskConfig
-from lerobot_wm.policies.latent.config import LatentPolicyConfig
-from lerobot_wm.policies.world_model.config import WorldModelConfig
+
+OWN_NAMES: Mapping[str, str] = MappingProxyType({})  # the rename_map that changes no name
 
 
-def check_dataset_fits(
-    config: PreTrainedConfig, dataset_meta: LeRobotDatasetMetadata, rename_map: dict[str, str]
+def check_fit(
+    config: PreTrainedConfig,
+    other: LeRobotDatasetMetadata | EnvConfig,
+    rename_map: Mapping[str, str] = OWN_NAMES,
 ) -> None:
-    """Refuse to train a policy of this package on a dataset that lacks what it needs; others are left to LeRobot.
+    """Check that a policy of this package fits a dataset to train on, or an environment to act in.
 
-    What needs the policy itself is checked when it is made; this is for what would be found after images were encoded
-    for it.
+    Other policies are left to LeRobot.
 
     Args:
-        config: Of the policy.
-        dataset_meta: Of the dataset, of images or of latents.
-        rename_map: New names of the dataset's features.
+        config: The policy's configuration; with `pretrained_path`, that of its checkpoint with changes by flags.
+        other: The dataset's metadata (of images or latents), or the environment's configuration.
+        rename_map: New names of the features of the dataset or environment.
 
     Raises:
-        ValueError: It lacks rewards or cameras, or has actions or numbers of another size than the checkpoint; or the
-            policy's settings are not those of the checkpoint's networks.
+        ValueError: Cameras, sizes, rewards or tasks do not fit.
     """
-    if isinstance(config, IQLConfig):
-        end_column(config, dataset_meta)
-    if not isinstance(config, ImagePolicyConfig) or config.pretrained_path is None:
+    if not isinstance(config, PolicyConfig):
         return
-    saved = read_config(config.pretrained_path, config.pretrained_revision)
-    assert isinstance(saved, ImagePolicyConfig)  # LeRobot has read it, as `config`
-    check_kept(config, saved)
-    check_networks(get_policy_class(saved.type), config, saved)
-    if OBS_LATENT not in dataset_meta.features:
-        cameras = [rename_map.get(key, key) for key in dataset_meta.camera_keys]
-        _check_cameras(saved, cameras, dataset_meta.repo_id)
-    with names_given_by(rename_map):
-        fit_to_dataset(deepcopy(config), saved, dataset_meta)
+    if isinstance(other, EnvConfig):
+        _check_environment(config, other, rename_map)
+        return
+    config.check_dataset(other)
+    if config.pretrained_path is not None:
+        check_reads(config, other, rename_map)
 
 
-def check_encoder_fits(
-    config: ImagePolicyConfig, dataset_meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]
+def check_reads(
+    config: PolicyConfig,
+    dataset_meta: LeRobotDatasetMetadata,
+    rename_map: Mapping[str, str] = OWN_NAMES,
 ) -> None:
-    """Refuse to encode a dataset without the numbers that a world model reads, or with them in another size.
-
-    Args:
-        config: Of the world model, or of a policy on its latents.
-        dataset_meta: Of the dataset of images.
-        rename_map: New names of its features.
+    """Check that a dataset has all that a trained policy or world model reads, in the sizes it was trained with.
 
     Raises:
-        ValueError: A feature is missing or of another size than in training.
+        ValueError: A feature is missing or has another size. Cameras may have any size, and latents stand for them.
     """
-    model = config.world_model if isinstance(config, LatentPolicyConfig) else config
-    assert isinstance(model, WorldModelConfig)  # `load_encoder` takes nothing else
-    keys = [key for key in model.features_read if key not in model.cameras]
-    keys += [] if model.action_dim is None else [ACTION]
+    keys = _vectors(config)
     missing = [key for key in names_before(keys, rename_map) if key not in dataset_meta.features]
     if missing:
         raise ValueError(
-            f"{dataset_meta.repo_id} has no {', '.join(missing)}, which the world model reads; it has "
-            f"{', '.join(dataset_meta.features)}: use a dataset of the kind it was trained on."
+            f"{dataset_meta.repo_id} has no {', '.join(missing)}, which this {config.type} reads; it has "
+            f"{', '.join(dataset_meta.features)}. Use a dataset of the kind it was trained on, or --rename_map."
         )
-    check_sizes(
-        model,
-        keys,
-        dataset_meta,
-        rename_map,
-        "encode data of the same robot, or train another world model on this dataset",
-    )
+    check_sizes(config, dataset_meta, rename_map)
+    if OBS_LATENT not in dataset_meta.features:
+        cameras = [rename_map.get(key, key) for key in dataset_meta.camera_keys]
+        check_cameras_present(config, cameras, dataset_meta.repo_id)
 
 
-def check_environment_fits(config: PreTrainedConfig, env: EnvConfig, rename_map: dict[str, str]) -> None:
-    """Refuse to evaluate a policy of this package in an environment that it cannot act in.
-
-    What other environments than metaworld_mt show is known when they are built: of them the cameras alone are checked.
-
-    Args:
-        config: Of the policy.
-        env: Of the environment.
-        rename_map: New names of the environment's features.
+def check_sizes(
+    config: PolicyConfig, dataset_meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]
+) -> None:
+    """Check a dataset's actions and vectors against the sizes a policy was trained with, where it has them.
 
     Raises:
-        ValueError: The policy has no actions, or has not seen such cameras, images, numbers or tasks.
+        ValueError: A size differs; names both.
     """
-    if isinstance(config, WorldModelConfig):
+    features = renamed(dataset_to_policy_features(dataset_meta.features), rename_map)
+    for key in filter(features.__contains__, _vectors(config)):
+        known = (config.output_features if key == ACTION else config.input_features)[key].shape
+        if known != features[key].shape:
+            raise ValueError(
+                f"This {config.type} was trained with '{key}' of size {known[0]}; {dataset_meta.repo_id} has size "
+                f"{features[key].shape[0]}. Use data of the same robot, or {train_new(config)}."
+            )
+
+
+def check_has_stats(dataset_meta: LeRobotDatasetMetadata) -> None:
+    """Check that a training dataset has statistics, which scale actions and proprioception.
+
+    LeRobot's loop would train without them.
+
+    Raises:
+        ValueError: It has none; says how to compute them.
+    """
+    if dataset_meta.stats is None:
+        raise ValueError(
+            f"{dataset_meta.repo_id} has no statistics ({dataset_meta.root}/{STATS_PATH}), which scale actions and "
+            "proprioception: compute them with lerobot-edit-dataset --operation.type=recompute_stats."
+        )
+
+
+def renamed(features: Mapping[str, PolicyFeature], rename_map: Mapping[str, str]) -> dict[str, PolicyFeature]:
+    """The features of a dataset or environment under the names that `--rename_map` gives them.
+
+    Raises:
+        ValueError: Two get the same name; which one is read would depend on their order.
+    """
+    names = {old: rename_map.get(old, old) for old in features}
+    for old, new in names.items():
+        others = [key for key, name in names.items() if name == new and key != old]
+        if others:
+            raise ValueError(
+                f"--rename_map: '{old}' and '{others[0]}' would both be named '{new}'. Give the one that is not to be "
+                "read another name too."
+            )
+    return {names[old]: feature for old, feature in features.items()}
+
+
+def names_before(keys: Iterable[str], rename_map: Mapping[str, str]) -> list[str]:
+    """The names that features have in the dataset itself, before `--rename_map` gives them these `keys`."""
+    before = {new: old for old, new in rename_map.items()}
+    return [before.get(key, key) for key in keys]
+
+
+_RENAME_MAP: ContextVar[Mapping[str, str]] = ContextVar("rename_map", default=OWN_NAMES)
+
+
+@contextmanager
+def names_given_by(rename_map: Mapping[str, str]) -> Iterator[None]:
+    """Let policies that are loaded here know `--rename_map`, which LeRobot gives to its processors only."""
+    token = _RENAME_MAP.set(rename_map)
+    try:
+        yield
+    finally:
+        _RENAME_MAP.reset(token)
+
+
+def current_names() -> Mapping[str, str]:
+    """The rename_map of the surrounding `names_given_by`."""
+    return _RENAME_MAP.get()
+
+
+def dataset_cameras(config: PolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> dict[str, PolicyFeature]:
+    """The policy's cameras as a dataset has them, as far as their names tell; none of a dataset of latents.
+
+    Names are those inside `names_given_by`. Under lerobot-train, which does not tell them, cameras that all have one
+    size need none.
+    """
+    features = dataset_to_policy_features(dataset_meta.features)
+    shapes = {features[key].shape for key in image_keys(features)}
+    alike = {key: PolicyFeature(FeatureType.VISUAL, *shapes) for key in config.cameras if len(shapes) == 1}
+    known = renamed(features, current_names())
+    return alike | {key: known[key] for key in config.cameras if key in known}
+
+
+def _vectors(config: PolicyConfig) -> list[str]:
+    """Keys of the vectors that a trained policy reads or predicts."""
+    vectors = [key for key in config.features_read if key not in config.cameras]
+    # A frozen image backbone reads no actions.
+    return vectors if config.action_dim is None else [*vectors, ACTION]
+
+
+def _check_environment(config: PolicyConfig, env: EnvConfig, rename_map: Mapping[str, str]) -> None:
+    if not config.chooses_actions:
         raise ValueError(
             f"{config.pretrained_path} ({config.type}) makes latents and chooses no actions: train a policy on them, "
             "--policy.type=wm_bc or wm_iql, and evaluate that."
         )
-    if not isinstance(config, ImagePolicyConfig):
-        return
     features = renamed(env_to_policy_features(env), rename_map)
-    visual = [key for key, feature in features.items() if feature.type is FeatureType.VISUAL]
+    cameras: Collection[str] = image_keys(features)
     if not isinstance(env, MetaworldMTEnvConfig):
-        if not set(visual) <= set(config.cameras):  # some declare fewer than they show
-            _check_cameras(config, visual, f"--env.type={env.type}")
+        # What other environments show is known when they are built; some declare fewer cameras than they have.
+        if not set(cameras) <= set(config.cameras):
+            check_cameras_present(config, cameras, f"--env.type={env.type}")
         return
-    _check_cameras(config, visual, f"--env.type={env.type} --env.camera_name={env.camera_name}")
-    check_observation(config, {key: torch.zeros(1, *feature.shape) for key, feature in features.items()})
-    if isinstance(config, LatentPolicyConfig):
-        config.check_environment_state(features)
-    if isinstance(config, MultiTaskConfig):
-        config.check_tasks({task_description(task) for task in resolve_tasks(env.task)})
-
-
-def _check_cameras(config: ImagePolicyConfig, shown: Collection[str], where: str) -> None:
-    missing = [key for key in config.cameras if key not in shown]
-    if missing:
-        raise ValueError(
-            f"This {config.type} sees {', '.join(missing)}; {where} has the cameras {', '.join(shown) or 'none'}: use "
-            "one with all it sees (--env.camera_name of metaworld_mt), or give these names to cameras that show the "
-            "same, by --rename_map."
-        )
+    check_cameras_present(config, cameras, f"--env.type={env.type} --env.camera_name={env.camera_name}")
+    config.check_shapes({key: tuple(feature.shape) for key, feature in features.items()})
+    check_tasks(config, {task_description(task) for task in resolve_tasks(env.task)})

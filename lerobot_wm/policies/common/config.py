@@ -1,41 +1,74 @@
-"""What the configurations of all our policy types have in common, unless they say otherwise."""
+"""The settings that all our policy types share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import torch
-from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.optim import LRSchedulerConfig
 
-from lerobot_wm.policies.common.features import IDENTITY_NORMALIZATION
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot_wm.policies.common.optim import FinalDecayConfig, FusedAdamConfig
+
+# Scaling is part of our models (lerobot_wm.nn.normalize): a policy and the frozen world model inside it are fitted to
+# different statistics, which one processor pipeline cannot hold. LeRobot's normalizers do nothing.
+IDENTITY_NORMALIZATION: dict[str, NormalizationMode] = dict.fromkeys(
+    ("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
+)
 
 
 @dataclass
-class SingleFramesConfig(PreTrainedConfig):
-    """A policy that is trained on single frames, and scales what it reads by itself."""
+class PolicyConfig(PreTrainedConfig):
+    """Base of all our policy configurations: cameras, precision, and Adam at one learning rate.
+
+    Args:
+        image_key: The cameras, separated by commas: observation.images.corner2,observation.images.topview. Their images
+            are stacked in this order. None takes all cameras of the dataset.
+        lr: Learning rate of Adam.
+        lr_decay_share: Last part of the training steps, over which the learning rate falls linearly to zero. 0, as in
+            the paper, keeps it constant. Not for IQL, whose actors follow a cosine.
+        dtype: Autocast type of training, "bfloat16" or "float32". None picks the faster one for the device once; the
+            checkpoint keeps it.
+        compile_model: Compile the networks (`torch.compile`): the recurrence of a world model, the networks of a policy
+            on latents. Compiling takes minutes at the start; on a GPU the networks then run as CUDA graphs.
+    """
+
+    # Whether policies of this type choose actions. World models do not.
+    chooses_actions: ClassVar[bool] = True
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict(IDENTITY_NORMALIZATION)
     )
+    image_key: str | None = None
+    lr: float = 3e-4
+    lr_decay_share: float = 0.0
+    dtype: str | None = None
+    compile_model: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        others = {
-            name: mode
+        scaled = {
+            name: mode.value
             for name, mode in self.normalization_mapping.items()
             if mode != NormalizationMode.IDENTITY
         }
-        if others:
+        if scaled:
             raise ValueError(
-                f"--policy.normalization_mapping={ {name: mode.value for name, mode in others.items()} }: scaling is "
-                "part of these models, which know the dataset's statistics, and what LeRobot scales before would be "
-                "scaled twice. Leave the flag out."
+                f"--policy.normalization_mapping={scaled}: these models scale their inputs themselves, and LeRobot "
+                "would scale them a second time. Leave the flag out."
             )
         if self.n_obs_steps != 1:
             raise ValueError(
-                f"--policy.n_obs_steps={self.n_obs_steps}: these policies look at one frame at a time, and a world "
-                "model remembers the others. Leave the flag out."
+                f"--policy.n_obs_steps={self.n_obs_steps}: these policies read one frame at a time; the world model "
+                "remembers earlier ones. Leave the flag out."
             )
+        if not 0 <= self.lr_decay_share <= 1:
+            raise ValueError(
+                f"--policy.lr_decay_share={self.lr_decay_share:g}: expected a share between 0 and 1."
+            )
+        self.dtype = training_dtype(self.dtype, str(self.device))
 
     @property
     def observation_delta_indices(self) -> list[int] | None:
@@ -52,23 +85,244 @@ class SingleFramesConfig(PreTrainedConfig):
         """Single frames."""
         return None
 
+    def get_optimizer_preset(self) -> FusedAdamConfig:
+        """Adam without clipping."""
+        return FusedAdamConfig(lr=self.lr)
 
-@dataclass
-class CompileConfig(PreTrainedConfig):
-    """Base of the configurations whose training launches many small operations.
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        """A constant learning rate; with `lr_decay_share` it falls to zero at the end."""
+        return FinalDecayConfig(share=self.lr_decay_share) if self.lr_decay_share else None
 
-    Args:
-        compile_model: Compile these (`torch.compile`): a world model's recurrence, the networks of a policy on its
-            latents. Takes minutes when the training starts; on a GPU they then run as CUDA graphs.
+    @property
+    def cameras(self) -> list[str]:
+        """Feature keys of the cameras; empty for a policy without images, or before `choose_cameras`."""
+        return self.image_key.split(",") if self.image_key else []
+
+    @property
+    def features_read(self) -> list[str]:
+        """Keys of the observation that the policy reads."""
+        return list(self.input_features)
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(H, W) that the images of all cameras are resized to: the first camera's."""
+        _, height, width = self.input_features[self.cameras[0]].shape
+        return height, width
+
+    @property
+    def image_shape(self) -> tuple[int, int, int]:
+        """(C, H, W) of the stacked images."""
+        channels = sum(self.input_features[key].shape[0] for key in self.cameras)
+        return channels, *self.image_size
+
+    @property
+    def state_dim(self) -> int:
+        """Size of the proprioceptive state."""
+        return feature_dim(self.input_features, OBS_STATE)
+
+    @property
+    def action_dim(self) -> int | None:
+        """Size of the actions that the model reads or chooses; None where it reads none."""
+        return feature_dim(self.output_features, ACTION)
+
+    def choose_cameras(self) -> None:
+        """Check `image_key`, or take all cameras where it is None; other cameras are removed from the inputs.
+
+        Raises:
+            ValueError: There is no camera, one is unknown or repeated, or their numbers of channels differ.
+        """
+        known = image_keys(self.input_features)
+        chosen = known if self.image_key is None else [key.strip() for key in self.image_key.split(",")]
+        if not chosen or not set(chosen) <= set(known) or len(set(chosen)) < len(chosen):
+            raise ValueError(
+                f"--policy.image_key is {self.image_key!r}; the dataset has the cameras {', '.join(known) or 'none'}. "
+                f"{self.type} needs at least one: set --policy.image_key to some of these, separated by commas, "
+                "without repeating any."
+            )
+        channels = {key: self.input_features[key].shape[0] for key in chosen}
+        if len(set(channels.values())) > 1:
+            raise ValueError(
+                f"The cameras have different numbers of channels: {channels}. Set --policy.image_key to cameras with "
+                "the same number, separated by commas."
+            )
+        self.image_key = ",".join(chosen)
+        for key in set(known) - set(chosen):
+            del self.input_features[key]
+
+    def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Take what a new policy needs to know of its dataset, such as the tasks, before its networks are built.
+
+        Values are replaced, not kept: the settings may be those of a finished run. Subclasses extend this.
+        """
+
+    def check_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Check that the dataset has what training needs besides observations and actions, such as rewards.
+
+        Raises:
+            ValueError: Something is missing.
+        """
+
+    def check_unchanged(self, saved: Self) -> None:
+        """Check that flags leave alone what the weights of a checkpoint depend on. Subclasses extend this.
+
+        Args:
+            saved: The configuration as it is in the checkpoint.
+
+        Raises:
+            ValueError: A flag changed it, or the environment or robot has actions of another size.
+        """
+        if [key.strip() for key in self.cameras] != saved.cameras:
+            raise ValueError(
+                f"--policy.image_key={self.image_key}: this {saved.type} was trained on the cameras "
+                f"{saved.image_key or 'none'}, in this order. Leave the flag out, map other cameras to these names "
+                f"with --rename_map, or {train_new(saved)}."
+            )
+        known, found = saved.output_features.get(ACTION), self.output_features.get(ACTION)
+        if known is not None and found is not None and tuple(known.shape) != tuple(found.shape):
+            raise ValueError(
+                f"This {saved.type} was trained with '{ACTION}' of size {known.shape[0]}, the robot, environment or "
+                f"dataset has size {found.shape[0]}: use the kind it was trained on, or {train_new(saved)}."
+            )
+
+    def check_shapes(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """Check the shapes of one observation against those the policy was trained on.
+
+        Args:
+            shapes: Shape of each feature, without the batch: (C, H, W) of cameras, (N,) of vectors.
+
+        Raises:
+            ValueError: A feature is missing or has another shape; says where it can be set.
+        """
+        check_cameras_present(self, [key for key in shapes if is_image(key)], "the observation")
+        for key in self.features_read:
+            expected = tuple(self.input_features[key].shape)
+            if key not in shapes:
+                raise ValueError(
+                    f"The observation has no '{key}'; this policy was trained with {expected[0]} numbers. "
+                    f"{_HINTS.get(key, 'Add it to the robot or environment')}."
+                )
+            if shapes[key] == expected:
+                continue
+            if key in self.cameras:
+                raise ValueError(
+                    f"'{key}' is {shapes[key]}, this policy was trained on {expected} (C, H, W): set the camera or "
+                    f"environment to height {expected[1]} and width {expected[2]} (--robot.cameras of a robot, "
+                    f"--env.image_size={expected[1]} for metaworld_mt)."
+                )
+            raise ValueError(
+                f"'{key}' has {shapes[key][-1]} numbers, this policy was trained with {expected[0]}: use the kind of "
+                "robot or environment its dataset was recorded on."
+            )
+
+
+_HINTS = {
+    OBS_STATE: "Add it to the robot or environment (--env.obs_type=pixels_agent_pos of LeRobot's environments)",
+    OBS_ENV_STATE: (
+        "Evaluate with --env.environment_state=true (metaworld_mt), or train without "
+        "--policy.use_environment_state"
+    ),
+}
+
+
+def train_new(config: PreTrainedConfig) -> str:
+    """Advice for the end of a message: how to get a policy with other networks."""
+    return f"train a new {config.type} with --policy.type={config.type} instead of --policy.path"
+
+
+def is_image(key: str) -> bool:
+    """Whether a key of a batch names a camera's images."""
+    return key.startswith("observation.image") and not key.endswith("_is_pad")
+
+
+def check_cameras_present(config: PolicyConfig, present: Collection[str], where: str) -> None:
+    """Check that all cameras of a trained policy are among those `present`; `where` names their source.
+
+    Raises:
+        ValueError: A camera is missing; names it and those present.
     """
+    missing = [key for key in config.cameras if key not in present]
+    if missing:
+        raise ValueError(
+            f"This {config.type} needs the cameras {', '.join(missing)}; {where} has {', '.join(present) or 'none'}. "
+            "Add them (--env.camera_name=corner2,topview for metaworld_mt), or map cameras with the same view to these "
+            "names with --rename_map."
+        )
 
-    compile_model: bool = False
+
+def check_tasks(config: Any, names: Iterable[str]) -> None:
+    """Check that an acting policy of this configuration was trained on the tasks of these names.
+
+    Raises:
+        ValueError: A task is unknown; names it and the known ones.
+    """
+    unknown = set(names) - set(config.tasks)
+    if unknown:
+        raise ValueError(
+            f"Unknown task {sorted(unknown)}; this policy was trained on {config.tasks}. Use one of these strings, or "
+            "continue training with --policy.path on a dataset that has the new task."
+        )
+
+
+def check_acting(config: Any) -> None:
+    """Check the settings that all acting policies have.
+
+    Raises:
+        ValueError: The action noise is negative.
+    """
+    if config.action_noise < 0:
+        raise ValueError(f"--policy.action_noise={config.action_noise:g}: a standard deviation is 0 or more.")
+
+
+def task_names(dataset_meta: LeRobotDatasetMetadata) -> list[str]:
+    """The task strings of a dataset, in order of task_index."""
+    return [str(task) for task in dataset_meta.tasks.index]
+
+
+def feature_dim(features: dict[str, PolicyFeature], key: str) -> int:
+    """Size of the vector feature `key`.
+
+    Raises:
+        ValueError: The feature is missing, or is a single number: LeRobot drops its axis, and the batch (1, B) it makes
+            of B numbers cannot be told from one vector of B numbers.
+    """
+    if key not in features:
+        raise ValueError(f"The dataset has no '{key}'; it has {sorted(features)}.")
+    size = features[key].shape[0]
+    if size == 1:
+        raise ValueError(
+            f"'{key}' has the shape (1,); expected two numbers or more, because LeRobot's batches lose the axis of a "
+            "single one. Record it with a second number, which may be constant."
+        )
+    return size
+
+
+def image_keys(features: dict[str, PolicyFeature]) -> list[str]:
+    """The camera keys among the features, in order."""
+    return [key for key, feature in features.items() if feature.type is FeatureType.VISUAL]
+
+
+def training_dtype(dtype: str | None, device: str) -> str:
+    """The autocast type of training: `dtype`, or the device's default where it is None.
+
+    Raises:
+        ValueError: It is unknown; LeRobot and accelerate would use float32 without a word.
+    """
+    if dtype not in (None, "bfloat16", "float32"):
+        raise ValueError(f"--policy.dtype is '{dtype}'; expected 'bfloat16' or 'float32'.")
+    return dtype or default_dtype(device)
+
+
+def default_dtype(device: str) -> str:
+    """The autocast type in which training is fastest: bfloat16 where the hardware multiplies it, else float32."""
+    if device.startswith("cuda"):
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    return "bfloat16" if device == "cpu" and torch.cpu._is_avx512_bf16_supported() else "float32"
 
 
 def compiled[**Inputs](function: Callable[Inputs, Any]) -> Callable[Inputs, Any]:
-    """`function`, compiled when it is first called, and again for inputs of another shape.
+    """Compile `function` at its first call, and again for inputs of another shape.
 
-    Its noise is drawn by other generators than the plain function's. A GPU runs it as CUDA graphs, whose outputs the
-    next call overwrites.
+    Its random numbers come from other generators than the plain function's. On a GPU it runs as CUDA graphs, whose
+    outputs the next call overwrites.
     """
     return torch.compile(function, mode="reduce-overhead", dynamic=False)

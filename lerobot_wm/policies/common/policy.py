@@ -1,5 +1,8 @@
-"""Strict loading of checkpoints."""
+"""The base classes of all our policies: how one is created, loaded, trained and saved, and what acting ones share."""
 
+import logging
+import zlib
+from collections.abc import Iterator, Mapping
 from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, NoReturn, Self
@@ -11,28 +14,100 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
 
-from lerobot_wm.hub.model_card import TrainingData, model_card
-from lerobot_wm.policies.common.checkpoint import WHOLE, not_finite, read_config
-from lerobot_wm.policies.common.fine_tuning import (
-    check_action_size,
-    check_kept,
-    check_networks,
-    fit_to_dataset,
-)
-from lerobot_wm.policies.world_model.config import WorldModelConfig
+from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE, TASK
+from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.nn.normalize import Affine
+from lerobot_wm.policies.common.card import TrainingData, model_card
+from lerobot_wm.policies.common.checkpoint import WHOLE, CheckpointError, cut_short, not_finite, read_config
+from lerobot_wm.policies.common.checks import check_has_stats, check_sizes, current_names, dataset_cameras
+from lerobot_wm.policies.common.config import PolicyConfig, check_tasks, feature_dim, task_names, train_new
+from lerobot_wm.policies.common.divergence import check_finite, check_finite_weights
 
-# What `from_pretrained` is told of the Hub, for each file.
+logger = logging.getLogger(__name__)
+
+Statistics = Mapping[str, Mapping[str, Any]]
+
+# Options of the Hub that `from_pretrained` passes on for each file.
 _HUB_OPTIONS = ("revision", "token", "cache_dir", "force_download", "local_files_only")
+_RANGE_TOLERANCE = 0.05  # share of a dataset's range that noise in a few frames adds
+_WHITE = 1.01  # resizing and floating point may exceed 1 a little; a camera's bytes exceed this
 
 
-class StrictPolicy(PreTrainedPolicy):
-    """A LeRobot policy whose checkpoints must match to the last key and hold finite numbers."""
+class BasePolicy(PreTrainedPolicy):
+    """A LeRobot policy that is built from its configuration alone, and whose checkpoints must match exactly.
 
-    # LeRobot insists on both for every class; each policy type sets its own.
-    config_class = PreTrainedConfig
-    name = "wm"
+    A new policy is created for a dataset: the configuration takes sizes and tasks from it, `build` makes the networks,
+    `fit_dataset` sets what the dataset's statistics decide. A loaded policy is built from the configuration in its
+    checkpoint, and its weights and scalings stay; `continue_training` prepares it for a dataset.
+
+    Subclasses define `build` and `compute_loss`, and extend `fit_dataset` and `prepare_training`.
+    """
+
+    # LeRobot requires both of every class; each policy type sets its own.
+    config_class = PolicyConfig
+    name = "base"
+    config: PolicyConfig
+
+    def __init__(
+        self,
+        config: PolicyConfig,
+        dataset_stats: Statistics | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        """Create a policy; without a dataset its scalings are those of random numbers, until weights are loaded.
+
+        Args:
+            config: Its settings; with a dataset, sizes and tasks in it are replaced by the dataset's.
+            dataset_stats: The dataset's statistics; None takes those of `dataset_meta`.
+            dataset_meta: The dataset to train a new policy on.
+        """
+        super().__init__(config)
+        if dataset_meta is not None:
+            check_has_stats(dataset_meta)
+            config.fill_from_dataset(dataset_meta)
+        config.validate_features()
+        self.build()
+        if dataset_meta is not None:
+            self.fit_dataset(dataset_stats or dataset_meta.stats, dataset_meta)
+            self.prepare_training(dataset_meta)
+
+    def build(self) -> None:
+        """Make the networks and buffers from the configuration alone."""
+        raise NotImplementedError
+
+    def fit_dataset(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Set what a new policy's dataset decides and its checkpoints keep, such as scalings."""
+
+    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Add what only training on this dataset needs, to a new policy and to a loaded one."""
+
+    def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Prepare a loaded policy for training on a dataset, whose cameras may have other sizes than before."""
+        self.config.input_features |= dataset_cameras(self.config, dataset_meta)
+        self.prepare_training(dataset_meta)
+
+    def compute_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+        """The scalar loss of a training batch, and its parts by name: detached scalars."""
+        raise NotImplementedError
+
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
+        """The training loss, and its parts as numbers for the log.
+
+        Args:
+            batch: See `compute_loss` of the policy type.
+
+        Raises:
+            DivergenceError: The loss is NaN or infinite.
+        """
+        loss, parts = self.compute_loss(batch)
+        scalars = {**parts, "loss": loss.detach()}
+        # One transfer from the device for all of them.
+        numbers = dict(zip(scalars, torch.stack(list(scalars.values())).tolist(), strict=True))
+        check_finite(numbers, self.config, batch)
+        del numbers["loss"]
+        return loss, numbers
 
     @classmethod
     def from_pretrained(
@@ -44,70 +119,77 @@ class StrictPolicy(PreTrainedPolicy):
         strict: bool = True,
         **kwargs: Any,
     ) -> Self:
-        """Load a checkpoint from a folder or the Hub; strict unless told otherwise.
+        """Load a checkpoint from a folder or the Hub.
 
-        What it was trained with stays: weights, and the statistics that scale actions and proprioception. These are no
-        dataset's own once training goes on with another, but the weights were fitted to them.
+        It keeps its weights, and the statistics that scale actions and proprioception: the weights were fitted to them.
 
         Args:
             pretrained_name_or_path: Folder or Hub id.
-            config: Its configuration, with changes; None takes the checkpoint's.
-            dataset_meta: The dataset to train it on; None to act.
-            strict: Whether weights must match to the last key.
+            config: Its configuration with changes; None takes the checkpoint's.
+            dataset_meta: The dataset to continue training on; None to act.
+            strict: Whether weights must match exactly.
             **kwargs: LeRobot's, such as `revision`.
 
         Raises:
             FileNotFoundError: The configuration or the weights are missing.
-            ValueError: The checkpoint is of another type, its configuration is not one of this release, `config` makes
-                other networks, keys are missing, left over or of another shape, weights are not finite, or the sizes
-                of the dataset or environment are not the checkpoint's.
+            CheckpointError: The checkpoint is of another type or damaged, or its weights do not match `config`.
+            ValueError: `config` changes what the weights depend on, or sizes of the dataset or environment differ.
         """
         hub = {name: kwargs[name] for name in _HUB_OPTIONS if name in kwargs}
         saved = read_config(pretrained_name_or_path, **hub)
         if not isinstance(saved, cls.config_class):
-            raise ValueError(
-                f"{pretrained_name_or_path} is a {saved.type}, no {cls.name}: give a checkpoint of {cls.name}, or load "
-                f"it as what it is, --policy.type={saved.type}."
+            raise CheckpointError(
+                f"{pretrained_name_or_path} is a {saved.type}, not a {cls.name}: give a checkpoint of {cls.name}, or "
+                f"load it with --policy.type={saved.type}."
             )
-        config = config or deepcopy(saved)
-        kwargs.pop(
-            "dataset_stats", None
-        )  # the checkpoint's own hold; these may have other names (--rename_map)
-        check_kept(config, saved)
-        if strict:
-            check_networks(cls, config, saved)
-        if dataset_meta is None:
-            check_action_size(config, saved)
-        else:
-            fit_to_dataset(config, saved, dataset_meta)
-            kwargs["dataset_meta"] = dataset_meta
-        return super().from_pretrained(pretrained_name_or_path, config=config, strict=strict, **kwargs)
-
-    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """LeRobot's, without the revision of the checkpoint it was trained on from.
-
-        LeRobot would look for that revision in this one's repository when it loads it by name.
-        """
-        super()._save_pretrained(save_directory, state_dict)
-        config = copy(self.config)
-        config.pretrained_revision = None
-        config._save_pretrained(save_directory)
+        if config is None:
+            config = deepcopy(saved)
+        assert isinstance(config, cls.config_class)
+        config.check_unchanged(saved)
+        if dataset_meta is not None:
+            check_has_stats(dataset_meta)
+            check_sizes(saved, dataset_meta, current_names())
+        # The dataset's statistics, which LeRobot passes, are for new policies.
+        kwargs.pop("dataset_stats", None)
+        policy = super().from_pretrained(pretrained_name_or_path, config=config, strict=strict, **kwargs)
+        if dataset_meta is not None:
+            policy.continue_training(dataset_meta)
+            policy.to(config.device)
+        return policy
 
     @classmethod
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
-        if not Path(model_file).is_file():
-            raise FileNotFoundError(f"{model_file} is missing, the weights of the checkpoint: {WHOLE}.")
+        file = Path(model_file)
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}, the weights of the checkpoint, is missing: {WHOLE}.")
         try:
             model = super()._load_as_safetensor(model, model_file, map_location, strict)
-        except (RuntimeError, SafetensorError) as error:
-            raise ValueError(
-                f"{model_file} does not fit a {cls.name} of its config.json: {error}. The file was cut short or "
-                "belongs to another configuration: copy the checkpoint folder again, whole."
+        except SafetensorError as error:
+            raise cut_short(file, error) from error
+        except RuntimeError as error:
+            raise CheckpointError(
+                f"{file} does not fit the networks of this {cls.name}: {error}. If a --policy flag changes the "
+                f"networks, leave it out, or {train_new(model.config)}. Otherwise config.json is of another "
+                f"checkpoint: {WHOLE}."
             ) from error
         bad = [name for name, tensor in model.state_dict().items() if not torch.isfinite(tensor).all()]
         if bad:
-            raise ValueError(f"{model_file} {not_finite(bad)}")
+            raise not_finite(file, bad)
         return model
+
+    def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
+        """Save as LeRobot does, if all weights are finite, without the revision of the checkpoint it started from.
+
+        LeRobot would look for that revision in the new policy's repository.
+
+        Raises:
+            DivergenceError: A weight is NaN or infinite.
+        """
+        check_finite_weights(self, self.config)
+        super()._save_pretrained(save_directory, *args, **kwargs)
+        config = copy(self.config)
+        config.pretrained_revision = None
+        config._save_pretrained(save_directory)
 
     def wrap_with_peft(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Refuse adapters (`--peft.*`): LeRobot loads their base with the settings of the trained policy.
@@ -116,29 +198,201 @@ class StrictPolicy(PreTrainedPolicy):
             ValueError: Always; says what to do instead.
         """
         raise ValueError(
-            f"--peft: {self.name} takes no adapters. Its networks are small: leave the --peft flags out, and all "
-            "weights are trained on from --policy.path."
+            f"--peft: {self.name} takes no adapters. Its networks are small: leave the --peft flags out, and "
+            "--policy.path trains all weights."
         )
 
     def generate_model_card(
         self,
-        dataset_repo_id: str,
-        model_type: str,
-        license: str | None,
-        tags: list[str] | None,
+        *args: Any,
         cfg: TrainPipelineConfig | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs: Any,
     ) -> ModelCard:
-        """The card that LeRobot publishes with a policy it has trained; its last two arguments tell all."""
+        """The card that LeRobot publishes with a policy after training; its other arguments are in `cfg`."""
         data = None if dataset_meta is None else TrainingData.of(dataset_meta)
-        repo_id = self.config.repo_id or model_type
-        makes_latents = isinstance(self.config, WorldModelConfig)
-        return model_card(
-            type(self),
-            self.config,
-            repo_id,
-            cfg,
-            data,
-            features_read=self.config.features_read,
-            makes_latents=makes_latents,
-        )
+        return model_card(self.config, self.config.repo_id or self.name, cfg, data)
+
+
+class ActingPolicy(BasePolicy):
+    """Base of the policies that choose actions: tasks as one-hot ids, scaled proprioception and actions, action noise.
+
+    Subclasses also define `observation_networks`, `task_start`, `actor_mean` and `select_action`.
+    """
+
+    def build(self) -> None:
+        """Make the scalings."""
+        self.state_scaling = Affine(self.config.state_dim)
+        self.action_scaling = Affine(feature_dim(self.config.output_features, ACTION))
+        self._action_noise = ActionNoise(self.config.action_noise)
+
+    def fit_dataset(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Scale proprioception and actions by the dataset's statistics."""
+        self.set_scalings(stats)
+
+    def set_scalings(self, stats: Statistics) -> None:
+        """Scale proprioception to unit variance and actions to [-1, 1] by these statistics."""
+        self.state_scaling.set_standard(*statistics(stats, OBS_STATE, "mean", "std"))
+        self.action_scaling.set_range(*statistics(stats, ACTION, "min", "max"))
+
+    def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Also learn the dataset's new tasks."""
+        super().continue_training(dataset_meta)
+        self.add_tasks(task_names(dataset_meta))
+        self.warn_if_actions_out_of_range(dataset_meta)
+
+    def warn_if_actions_out_of_range(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Warn of actions in a dataset that this policy, scaled as in its first training, cannot command."""
+        low, high = statistics(dataset_meta.stats or {}, ACTION, "min", "max")  # (A,), on the CPU
+        ends = (torch.full_like(self.action_scaling.offset, end) for end in (-1.0, 1.0))
+        lowest, highest = (self.action_scaling.inverse(end).cpu() for end in ends)  # (A,)
+        tolerance = _RANGE_TOLERANCE * (high - low)
+        outside = (low < lowest - tolerance) | (high > highest + tolerance)
+        for i in torch.nonzero(outside).flatten().tolist():
+            logger.warning(
+                "Number %d of the actions ranges from %.3g to %.3g in %s; this policy was first trained on %.3g to "
+                "%.3g and cannot command the rest. If that matters, train a new --policy.type=%s on both datasets.",
+                *(i, low[i], high[i], dataset_meta.repo_id, lowest[i], highest[i], self.config.type),
+            )
+
+    def observation_networks(self) -> list[MLP]:
+        """The networks that read the observation (B, O), and perhaps more after it."""
+        raise NotImplementedError
+
+    @property
+    def task_start(self) -> int:
+        """Index in the observation at which the one-hot task id begins."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def add_tasks(self, tasks: list[str]) -> None:
+        """Add tasks after the known ones, with zero weights, so that known tasks are acted on as before.
+
+        Args:
+            tasks: Task strings; known ones are skipped.
+        """
+        new = [task for task in tasks if task not in self.config.tasks]
+        if not new:
+            return
+        for network in self.observation_networks():
+            network.insert_inputs(self.task_start + len(self.config.tasks), len(new))
+        logger.info("New tasks: %s; known ones: %s", new, self.config.tasks)
+        self.config.tasks = [*self.config.tasks, *new]
+
+    def actor_mean(self, observation: Tensor) -> Tensor:
+        """The policy's action (B, A), scaled to [-1, 1], for observations (B, O)."""
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        """Forget the episode; LeRobot calls this between episodes."""
+        self._action_noise.reset()
+
+    def act(self, observation: Tensor, batch: dict[str, Any]) -> Tensor:
+        """The policy's mean action with `action_noise`, clipped to the dataset's range, in its units: (B, A).
+
+        Args:
+            observation: The networks' input, (B, O).
+            batch: What `select_action` was given.
+        """
+        action = self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))
+        if self.config.action_noise == 0:
+            return action
+        noisy = self._action_noise(self.action_scaling(action), batch)  # (B, A)
+        return self.action_scaling.inverse(noisy.clamp(-1, 1))
+
+    def one_hot_tasks(self, batch: dict[str, Any], batch_size: int) -> Tensor:
+        """One-hot task ids (B, N) from the batch's task strings, or from a single string for all of it.
+
+        A policy that knows one task performs it whatever the string: simulators name tasks in their own words.
+
+        Raises:
+            ValueError: A policy of several tasks is given no string, or one that it was not trained on.
+        """
+        known = self.config.tasks
+        given = batch.get(TASK) or [""] * batch_size  # lerobot-rollout gives "" when it was given none
+        if isinstance(given, str):
+            given = [given] * batch_size
+        names = [known[0]] * batch_size if len(known) == 1 else given
+        if "" in set(names) - set(known):
+            raise ValueError(
+                f"The batch has no '{TASK}' strings; this policy knows {len(known)} tasks: {known}. Give one of these "
+                "strings (--task for lerobot-rollout)."
+            )
+        check_tasks(self.config, names)
+        index = {task: i for i, task in enumerate(known)}
+        ids = torch.tensor([index[name] for name in names], device=self.state_scaling.offset.device)
+        return nn.functional.one_hot(ids, len(known)).float()
+
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """`select_action` as a chunk of one: (B, 1, A)."""
+        return self.select_action(batch, **kwargs)[:, None]
+
+
+def check_observation(config: PolicyConfig, batch: dict[str, Any]) -> None:
+    """Check what a policy is shown: each camera (B, C, H, W) in [0, 1], and vectors (B, N) such as `observation.state`.
+
+    Raises:
+        ValueError: A feature is missing or has another shape than in training, or images are not in [0, 1].
+    """
+    config.check_shapes(
+        {key: tuple(value.shape[1:]) for key, value in batch.items() if isinstance(value, Tensor)}
+    )
+    for key in config.cameras:
+        image = batch[key]
+        if not image.is_floating_point() or image.max() > _WHITE:
+            raise ValueError(
+                f"'{key}' is {image.dtype} with a maximum of {image.max().item():g}; expected floating-point numbers "
+                "in [0, 1]: divide a camera's bytes by 255, as prepare_observation_for_inference of "
+                "lerobot.policies.utils does."
+            )
+
+
+class ActionNoise:
+    """Gaussian noise on actions, one stream per rollout of a batch, seeded by the rollout's first observation.
+
+    A rollout is therefore repeatable: it does not depend on the other rollouts, their order, or global random numbers.
+
+    Args:
+        std: Standard deviation, in the units in which the dataset's actions span [-1, 1].
+    """
+
+    def __init__(self, std: float) -> None:
+        self.std = std
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the streams: the next call begins new rollouts."""
+        self._streams: list[torch.Generator] = []
+
+    def __call__(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
+        """Add the next step's noise to scaled actions (B, A), given the batch of `select_action`."""
+        if len(self._streams) != action.shape[0]:
+            self._streams = [torch.Generator().manual_seed(_digest(batch, i)) for i in range(action.shape[0])]
+        noise = torch.stack([torch.randn(action.shape[1], generator=stream) for stream in self._streams])
+        return action + self.std * noise.to(action)
+
+
+def _digest(batch: dict[str, Any], i: int) -> int:
+    """A number made of every bit of the tensors of row i."""
+    digest = 0
+    for key in sorted(key for key, value in batch.items() if isinstance(value, Tensor) and value.ndim > 1):
+        digest = zlib.crc32(batch[key][i].contiguous().cpu().numpy().tobytes(), digest)
+    return digest
+
+
+def statistics(stats: Statistics, key: str, *names: str) -> Iterator[Tensor]:
+    """Statistics of a dataset's feature, each as a float32 vector.
+
+    Raises:
+        ValueError: The dataset has no such statistic.
+    """
+    for name in names:
+        if name not in stats.get(key, {}):
+            if key.startswith(OBS_IMAGE):
+                fix = "LeRobot computes it for images at recording only: leave out --policy.rssm.standardize_images"
+            else:
+                fix = "lerobot-edit-dataset --operation.type=recompute_stats writes a copy of the dataset with it"
+            raise ValueError(
+                f"The dataset's meta/stats.json has no '{name}' of '{key}', which scales the model's inputs: {fix}."
+            )
+        yield torch.as_tensor(stats[key][name], dtype=torch.float32).flatten()

@@ -12,8 +12,8 @@ def make_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """LeRobot's defaults: batching and device placement in, device placement out.
+    """LeRobot's default steps: batching and device placement before the policy, device placement after it.
 
-    The normalisers among them do nothing (`IDENTITY_NORMALIZATION`): scaling is part of our models.
+    Its normalizers do nothing (`IDENTITY_NORMALIZATION`): scaling is part of our models.
     """
     return make_default_pre_post_processors(config, dataset_stats)

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_wm.policies.common.lr_decay import LRDecayConfig
 from lerobot_wm.policies.e2e.config import E2EConfig
 
 
 @PreTrainedConfig.register_subclass("e2e_bc")
 @dataclass
-class E2EBCConfig(LRDecayConfig, E2EConfig):
+class E2EBCConfig(E2EConfig):
     """Image encoder and two-layer MLP regressed on the demonstrated actions (paper section 3.2)."""

@@ -8,9 +8,7 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
-from lerobot_wm.policies.common.cameras import camera_images
-from lerobot_wm.policies.common.features import logged
-from lerobot_wm.policies.common.iql_agent import Outcomes, make_agent
+from lerobot_wm.policies.common.iql import RewardsAndEnds, make_agent
 from lerobot_wm.policies.e2e.policy import E2EPolicy
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
 
@@ -18,38 +16,41 @@ from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
 class E2EIQLPolicy(E2EPolicy):
     """An IQL agent on [image features, one-hot task, proprioception].
 
-    One image encoder serves actor, critics and value, and is trained by their three losses. What is not descended,
-    V(s') and the target critics, reads the same encoder without gradient.
+    One image encoder serves actor, critics and value, and is trained by their three losses. V(s') and the target
+    critics read the same encoder without gradient.
     """
 
     config_class = E2EIQLConfig
     name = "e2e_iql"
     config: E2EIQLConfig
 
-    def __init__(
-        self,
-        config: E2EIQLConfig,
-        dataset_stats: dict[str, dict[str, Any]] | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-    ) -> None:
-        super().__init__(config, dataset_stats, dataset_meta)
-        self.agent = make_agent(config, self.observation_dim, anew=dataset_stats is not None)
-        self.outcomes = Outcomes(config, dataset_meta)
+    def build(self) -> None:
+        """Make the encoder and the agent."""
+        super().build()
+        config = self.config
+        self.agent = make_agent(
+            config.iql, self.observation_dim, config.action_dim, config.hidden_dims, config.dropout
+        )
+        self.rewards_and_ends = RewardsAndEnds(config)
+
+    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Read rewards and ends from the dataset's columns."""
+        self.rewards_and_ends = RewardsAndEnds(self.config, dataset_meta)
 
     def get_optim_params(self) -> dict:
         """The agent's three groups, the actors first, and the encoder's, at a constant rate."""
         encoder = {"params": list(self.encoder.parameters())}
         return [*self.agent.param_groups(), encoder]  # type: ignore[return-value]
 
-    def heads(self) -> list[MLP]:
+    def observation_networks(self) -> list[MLP]:
         """The agent's networks."""
         return self.agent.networks()
 
     def actor_mean(self, observation: Tensor) -> Tensor:
         """Mean of the policy's Gaussian (B, A) for observations (B, O)."""
-        return self.agent.mean_action(observation, self.config.beta)
+        return self.agent.mean_action(observation, self.config.iql.beta)
 
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
+    def compute_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """Value, critic and actor losses on a batch of transitions.
 
         Args:
@@ -58,16 +59,15 @@ class E2EIQLPolicy(E2EPolicy):
                 `task` (B strings).
 
         Returns:
-            The sum of the losses and its parts by name.
+            The sum of the losses, and its parts by name.
         """
-        images, states = camera_images(self.config, batch), batch[OBS_STATE]  # (B, 2, C, H, W), (B, 2, P)
+        images, states = self.images(batch), batch[OBS_STATE]  # (B, 2, C, H, W), (B, 2, P)
         tasks = self.one_hot_tasks(batch, states.shape[0])  # (B, N)
         now = self.observation(images[:, 0], states[:, 0], tasks)  # (B, O)
         with torch.no_grad():
             following = self.observation(images[:, 1], states[:, 1], tasks)  # (B, O)
         action = self.action_scaling(batch[ACTION])  # (B, A)
-        loss, parts = self.agent.loss(now, following, action, *self.outcomes(batch))
-        return loss, logged(parts)
+        return self.agent.loss(now, following, action, *self.rewards_and_ends(batch))
 
     def update(self) -> None:
         """Move the target critics; LeRobot calls this after every optimizer step."""

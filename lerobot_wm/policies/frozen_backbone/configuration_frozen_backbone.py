@@ -13,17 +13,17 @@ RGB_CHANNELS = 3
 @PreTrainedConfig.register_subclass("frozen_backbone")
 @dataclass
 class FrozenBackboneConfig(WorldModelConfig):
-    """An image backbone in place of the world model: the control that tells what pretraining on the robot adds.
+    """An image backbone in place of the world model: the control that shows what pretraining on the robot adds.
 
-    It is not trained: `lerobot-wm init` writes its checkpoint, which `lerobot-wm encode` and
+    It is not trained. `lerobot-wm init` writes its checkpoint, which `lerobot-wm encode` and
     `--policy.world_model_path` take as they take a world model's.
 
     Args:
         backbone: A classification model of torchvision (resnet18), or `timm/NAME` for one of timm.
         weights_path: A local file with its weights, safetensors or a torch state dict (torchvision's, R3M's);
-            None leaves it at its random initialisation.
+            None keeps the random initialisation.
         backbone_image_size: Height and width that images are resized to; None takes the first camera's size.
-        latent_dim: Number of pooled features of all cameras together; filled when the policy is made.
+        latent_dim: Number of pooled features of all cameras together; filled when the policy is created.
     """
 
     backbone: str = "resnet18"
@@ -51,7 +51,7 @@ class FrozenBackboneConfig(WorldModelConfig):
         for key in self.cameras:
             channels = self.input_features[key].shape[0]
             if channels != RGB_CHANNELS:
-                raise ValueError(f"'{key}' has {channels} channels; backbones are made for RGB images.")
+                raise ValueError(f"'{key}' has {channels} channels; backbones take RGB images.")
         if self.backbone_image_size is None:
             self.backbone_image_size = max(self.image_size)
 

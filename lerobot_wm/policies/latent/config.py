@@ -1,80 +1,70 @@
 """What the configurations of the policies on world-model latents share."""
 
-from collections.abc import Container
-from copy import deepcopy
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from lerobot_wm.constants import OBS_ENV_STATE
-from lerobot_wm.policies.common.cameras import ImagePolicyConfig
-from lerobot_wm.policies.common.config import CompileConfig
-from lerobot_wm.policies.common.features import feature_dim
-from lerobot_wm.policies.common.multi_task_config import MultiTaskConfig
-from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
-from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_LATENT, OBS_STATE
+from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
+from lerobot_wm.policies.common.checkpoint import CheckpointError, open_checkpoint
+from lerobot_wm.policies.common.config import (
+    PolicyConfig,
+    check_acting,
+    feature_dim,
+    task_names,
+    train_new,
+)
 from lerobot_wm.policies.world_model.config import WorldModelConfig
-from lerobot_wm.world_model.config import RSSMConfig
+
+_MIN_LATENT_STD = 1e-5  # below it, scaling latents to unit variance would scale rounding errors
 
 
 @dataclass
-class LatentPolicyConfig(CompileConfig, ImagePolicyConfig, MultiTaskConfig):
+class LatentPolicyConfig(PolicyConfig):
     """A small multi-task policy on [latent, one-hot task, proprioception] (paper section 3.1.2).
 
     Args:
-        world_model_path: Folder or Hub id of a world model's checkpoint (wm_rssm), or of a frozen_backbone's that takes
-            its place; its frozen weights become part of this policy's.
-        use_latent: False leaves the latent out: the blind control, proprioception and task id only.
-        use_environment_state: True adds the simulator's full state, `observation.environment_state`: with
-            `use_latent=false` the control that is given the truth. The environment has to emit it.
-        updates_per_step: Into how many updates a step of `lerobot-wm train` divides its batch, one after the other on
-            batch_size / updates_per_step samples each. Of a step of LeRobot's loop, what is not the update takes longer
-            than an update of these small networks on a GPU. Schedules move on, and the loss is logged, once a step.
-        save_predicted_video: True has `lerobot-eval` write, beside its videos, one of each batch of rollouts
-            (`pred_episode_N.mp4`): what the world model expected to see at every step, and on its right what it saw.
-        world_model, image_key, world_model_fingerprint: Taken from that checkpoint when the policy is made.
-        rssm, frozen_backbone: Read from checkpoints of release 0.1.0, which have one of them in place of `world_model`.
+        hidden_dims: Widths of the hidden layers of every head.
+        dropout: Dropout of the actor.
+        action_noise: Standard deviation of Gaussian noise on the actions at test time, where the dataset's actions span
+            [-1, 1]. It frees a policy that hovers in a place where no demonstration ends.
+        tasks: Task strings in one-hot order, taken from the dataset when the policy is created.
+        world_model_path: Folder or Hub id of the checkpoint of a world model (wm_rssm) or of a frozen_backbone in its
+            place; its frozen weights become part of this policy's.
+        use_latent: False leaves the latent out: the blind control, which reads proprioception and task id only.
+        use_environment_state: True adds the simulator's full state, `observation.environment_state`. With
+            `use_latent=false` this is the control that knows the truth. The environment has to provide it.
+        save_predicted_video: True lets `lerobot-eval` write a video of each batch of rollouts beside its own
+            (`pred_episode_N.mp4`): what the world model expected to see at every step, and to its right what it saw.
+        world_model, image_key, world_model_fingerprint: Taken from that checkpoint when the policy is created.
     """
 
+    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
+    dropout: float = 0.1
+    action_noise: float = 0.0
+    tasks: list[str] = field(default_factory=list)
     world_model_path: str | None = None
     use_latent: bool = True
     use_environment_state: bool = False
-    updates_per_step: int = 1
     save_predicted_video: bool = False
     world_model: WorldModelConfig | None = None
     world_model_fingerprint: str | None = None
-    rssm: RSSMConfig | None = None
-    frozen_backbone: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.updates_per_step < 1:
-            raise ValueError(f"updates_per_step is {self.updates_per_step}; a step makes 1 or more.")
-        if self.rssm is not None or self.frozen_backbone is not None:
-            self.world_model = self._world_model_of_0_1_0()
-            self.rssm = self.frozen_backbone = None
+        check_acting(self)
 
-    def _world_model_of_0_1_0(self) -> WorldModelConfig:
-        """What release 0.1.0 wrote down as sizes alone."""
-        common: dict[str, Any] = {
-            "input_features": deepcopy(self.input_features),
-            "output_features": deepcopy(self.output_features),
-            "image_key": self.image_key,
-            "device": "cpu",
-        }
-        if self.rssm is not None:
-            return WMRSSMConfig(rssm=self.rssm, **common)
-        assert self.frozen_backbone is not None  # one of the two
-        old = self.frozen_backbone  # name, image_size, n_cameras, latent_dim
-        return FrozenBackboneConfig(
-            backbone=old["name"],
-            backbone_image_size=old["image_size"],
-            latent_dim=old["latent_dim"],
-            **common,
-        )
+    @property
+    def action_dim(self) -> int:
+        """Size of the action."""
+        return feature_dim(self.output_features, ACTION)
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """As its world model takes images."""
+        """(H, W) that the world model takes."""
         return super().image_size if self.world_model is None else self.world_model.image_size
 
     @property
@@ -92,40 +82,117 @@ class LatentPolicyConfig(CompileConfig, ImagePolicyConfig, MultiTaskConfig):
         """Whether the policy scales its latents by the dataset's statistics."""
         return self.world_model is not None and self.world_model.scales_latents
 
-    def check_environment_state(self, shown: Container[str]) -> None:
-        """Refuse an environment that does not emit the full state which the policy reads.
-
-        Raises:
-            ValueError: It is missing among what is `shown`.
-        """
-        if self.use_environment_state and OBS_ENV_STATE not in shown:
-            raise ValueError(
-                f"This policy reads '{OBS_ENV_STATE}', which the environment does not emit: evaluate it with "
-                "--env.environment_state=true (metaworld_mt), or train one without --policy.use_environment_state."
-            )
-
     @property
     def observation_dim(self) -> int:
         """Size of the networks' input: latent, one-hot task, proprioception, full state."""
         return self.latent_dim + len(self.tasks) + self.state_dim + self.env_state_dim
 
+    def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Take the tasks; the world model is read again from its path."""
+        self.tasks = task_names(dataset_meta)
+        self.world_model = None
+
     def validate_features(self) -> None:
-        """Check that what the policy reads is there and fits the frozen world model.
+        """Take the world model's configuration from its checkpoint, and reduce the inputs to those read at test time.
 
         Raises:
-            ValueError: A feature is missing, the action has another size than the world model's, or
-                `save_predicted_video` is set where nothing predicts.
+            ValueError: There is no world model, a feature is missing, the action has another size than the world
+                model's, or `save_predicted_video` is set where nothing predicts.
+            FileNotFoundError: The world model's checkpoint is not there.
         """
+        if self.use_latent and self.world_model is None:
+            self._take_world_model()
+        read = {OBS_STATE, *self.cameras, OBS_ENV_STATE if self.use_environment_state else None}
+        inputs = {key: feature for key, feature in self.input_features.items() if key in read}
+        if OBS_STATE not in inputs or inputs[OBS_STATE].type is not FeatureType.STATE:
+            raise ValueError(f"The dataset has no '{OBS_STATE}'; it has {sorted(self.input_features)}.")
+        self.input_features = inputs
         _ = self.state_dim, self.env_state_dim
         model = self.world_model
         if self.save_predicted_video and (model is None or not model.predicts_images):
             raise ValueError(
                 f"--policy.save_predicted_video=true, but this {self.type} has no world model that predicts images (it "
-                f"has {'no latents' if model is None else model.type}): leave the flag out, or take a policy on a "
-                "wm_rssm's latents."
+                f"has {'no latents' if model is None else model.type}): leave the flag out, or use a policy on the "
+                "latents of a wm_rssm."
             )
         if model is not None and model.action_dim not in (None, self.action_dim):
             raise ValueError(
                 f"The world model was trained with {model.action_dim}-d actions, this dataset or environment has "
                 f"{self.action_dim}-d ones: use the one it was trained on, or train another world model."
             )
+
+    def _take_world_model(self) -> None:
+        if self.world_model_path is None:
+            raise ValueError(
+                f"--policy.type={self.type} needs --policy.world_model_path=<folder or Hub id of a wm_rssm checkpoint>."
+            )
+        self.world_model = open_world_model(self.world_model_path)
+        self.image_key = self.world_model.image_key
+        self.input_features |= {key: self.world_model.input_features[key] for key in self.world_model.cameras}
+
+    def check_unchanged(self, saved: "LatentPolicyConfig") -> None:  # type: ignore[override]
+        """Also check that the world model is the checkpoint's."""
+        if self.world_model_path != saved.world_model_path:
+            raise ValueError(
+                f"--policy.world_model_path={self.world_model_path}: the checkpoint of --policy.path contains its own "
+                f"world model, {saved.world_model_path}, which it was trained on. Leave the flag out, or "
+                f"{train_new(saved)}."
+            )
+        super().check_unchanged(saved)
+
+    def check_latents(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Check that a dataset has latents, that they are of this world model, and that they vary.
+
+        The policy is then for cameras of the size that the latents were made from, whatever the world model was trained
+        on.
+
+        Raises:
+            ValueError: They do not fit; says how to encode the dataset.
+        """
+        if OBS_LATENT not in dataset_meta.features:
+            raise ValueError(
+                f"{dataset_meta.repo_id} has no '{OBS_LATENT}'. Encode it with the world model first (`lerobot-wm "
+                f"encode --world_model_path=... --dataset.repo_id={dataset_meta.repo_id} ...`), or train with "
+                "`lerobot-wm train`, which encodes it automatically."
+            )
+        record = LatentRecord.read(Path(dataset_meta.root))
+        tasks = task_names(dataset_meta)
+        if record.tasks != tasks:
+            raise ValueError(
+                f"{Path(dataset_meta.root) / RECORD_PATH} is of latents of the tasks {record.tasks}, but "
+                f"{dataset_meta.repo_id} has {tasks}: it belongs to another dataset or revision. Encode "
+                f"{record.source_repo_id} again."
+            )
+        record.check_world_model(self.world_model_fingerprint, self.world_model_path)
+        record.check_cameras(self.cameras, self.world_model_path)
+        for key, shape in record.camera_shapes.items():
+            self.input_features[key] = PolicyFeature(FeatureType.VISUAL, tuple(shape))
+        std = torch.as_tensor((dataset_meta.stats or {})[OBS_LATENT]["std"]).median().item()
+        if self.scales_latents and std < _MIN_LATENT_STD:
+            raise ValueError(
+                f"The latents of {self.world_model_path} hardly vary (median standard deviation {std:.1e}): a "
+                "policy would be blind. In an image backbone without trained weights the signal fades from layer to "
+                "layer: give --policy.weights_path to `lerobot-wm init`, or choose a residual network such as "
+                "resnet18. A world model whose latents are all the same needs another training loss."
+            )
+
+
+def open_world_model(path: str) -> WorldModelConfig:
+    """The configuration of the world model in a checkpoint: a world model's, or that of a policy on latents.
+
+    Args:
+        path: Folder, Hub id, or user/name@revision.
+
+    Raises:
+        FileNotFoundError: A file of the checkpoint is missing.
+        CheckpointError: It is damaged, or holds no world model.
+    """
+    config = open_checkpoint(path, with_processors=False)
+    if isinstance(config, WorldModelConfig):
+        return config
+    if isinstance(config, LatentPolicyConfig) and config.world_model is not None:
+        return config.world_model
+    raise CheckpointError(
+        f"{path} ({config.type}) holds no world model: give a checkpoint of wm_rssm, frozen_backbone or another type "
+        "of world model, or of a policy on their latents such as wm_bc or wm_iql."
+    )

@@ -1,78 +1,98 @@
 """A policy on the latents of a frozen world model: in training it reads them, at test time it filters images."""
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from torch import Tensor
+from lerobot.policies.factory import get_policy_class
+from torch import Tensor, nn
 from torchvision.utils import make_grid
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
+from lerobot_wm.data.latents import weights_fingerprint
+from lerobot_wm.nn.images import camera_images, side_by_side
 from lerobot_wm.nn.normalize import Affine
-from lerobot_wm.policies.common.cameras import camera_images, check_observation, side_by_side
-from lerobot_wm.policies.common.features import check_has_stats, logged, stat
-from lerobot_wm.policies.common.multi_task_policy import MultiTaskPolicy
-from lerobot_wm.policies.latent.config import LatentPolicyConfig
-from lerobot_wm.policies.latent.setup import check_latents, deployed_features, take_world_model
+from lerobot_wm.policies.common.checkpoint import read_config, split_revision
+from lerobot_wm.policies.common.policy import ActingPolicy, Statistics, check_observation, statistics
+from lerobot_wm.policies.latent.config import LatentPolicyConfig, open_world_model
+from lerobot_wm.policies.world_model.policy import WorldModelPolicy
 from lerobot_wm.world_model.interface import LatentModel, LatentState
 
 
-class LatentPolicy(MultiTaskPolicy):
-    """Base of `wm_bc` and `wm_iql`: holds the frozen world model, or what stands in its place, and the filter's state.
+class LatentPolicy(ActingPolicy):
+    """Base of `wm_bc` and `wm_iql`: holds the frozen world model, or an encoder in its place, and the filter's state.
 
-    Subclasses define `actor_mean`, and the training loss by `training_inputs` and `loss`.
+    Subclasses make the heads in `build`, and define `actor_mean` and `compute_loss`.
     """
 
     config: LatentPolicyConfig
     world_model: LatentModel  # with `use_latent`
 
-    def __init__(
-        self,
-        config: LatentPolicyConfig,
-        dataset_stats: dict[str, dict[str, Any]] | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-    ) -> None:
-        check_has_stats(dataset_meta)
-        anew = dataset_stats is not None
-        world_model = take_world_model(config, anew=anew) if config.use_latent else None
-        config.input_features = deployed_features(config)
-        if config.use_latent and dataset_meta is not None:  # to be trained
-            check_latents(config, dataset_meta)
-        super().__init__(config, dataset_stats, dataset_meta)
-        if world_model is not None:
-            # Laid out like the images it gets: else each decision copies all of its weights, most of its time.
-            self.world_model = world_model.requires_grad_(False).eval()
+    def build(self) -> None:
+        """Make the scalings and the world model, whose weights come from its checkpoint or the policy's."""
+        super().build()
+        config = self.config
+        if config.world_model is not None:
+            made = get_policy_class(config.world_model.type)(config.world_model)
+            self.world_model = made.world_model.requires_grad_(False).eval()
+            # The layout of its images. Otherwise each decision copies all weights, which takes most of its time.
             self.world_model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # its stub lacks it
         if config.scales_latents:
             self.latent_scaling = Affine(config.latent_dim)
-            if dataset_stats is not None:
-                self.latent_scaling.set_standard(
-                    stat(dataset_stats, OBS_LATENT, "mean"), stat(dataset_stats, OBS_LATENT, "std")
-                )
         if config.use_environment_state:
             self.env_state_scaling = Affine(config.env_state_dim)
-            if dataset_stats is not None:
-                self.env_state_scaling.set_standard(
-                    stat(dataset_stats, OBS_ENV_STATE, "mean"), stat(dataset_stats, OBS_ENV_STATE, "std")
-                )
         self.reset()
 
+    def fit_dataset(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Load the world model's weights, and set the scalings."""
+        config = self.config
+        if config.use_latent:
+            assert config.world_model_path is not None  # checked with the features
+            with torch.random.fork_rng(devices=[]):
+                encoder = load_encoder(config.world_model_path).world_model
+            self.world_model.load_state_dict(encoder.state_dict())
+            config.world_model_fingerprint = encoder_fingerprint(encoder)
+            config.check_latents(dataset_meta)
+        super().fit_dataset(stats, dataset_meta)
+        if config.scales_latents:
+            self.latent_scaling.set_standard(*statistics(stats, OBS_LATENT, "mean", "std"))
+        if config.use_environment_state:
+            self.env_state_scaling.set_standard(*statistics(stats, OBS_ENV_STATE, "mean", "std"))
+
+    def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Also check that the dataset's latents are of this world model."""
+        super().continue_training(dataset_meta)
+        if self.config.use_latent:
+            self.config.check_latents(dataset_meta)
+
     @property
-    def task_offset(self) -> int:
+    def task_start(self) -> int:
         """The one-hot task id follows the latent."""
         return self.config.latent_dim
 
     def train(self, mode: bool = True) -> "LatentPolicy":
-        """Switch training mode; the frozen world model stays in evaluation mode.
-
-        LeRobot does so at every step, for which the many modules of the world model are passed over.
-        """
+        """Switch training mode; the frozen world model stays in evaluation mode."""
         self.training = mode
         for name, module in self.named_children():
             if name != "world_model":
                 module.train(mode)
         return self
+
+    def named_modules(
+        self, memo: set[nn.Module] | None = None, prefix: str = "", remove_duplicate: bool = True
+    ) -> Iterator[tuple[str, nn.Module]]:
+        """The policy's modules without the frozen world model, so that `parameters` gives those of its own networks.
+
+        LeRobot walks through them at every training step, and the world model has many times more than the rest. What
+        goes through children is not affected: state dict, device, copies.
+        """
+        memo = set() if memo is None else memo
+        frozen = getattr(self, "world_model", None)
+        if frozen is not None:
+            memo.add(frozen)
+        return super().named_modules(memo, prefix, remove_duplicate)
 
     def observation(
         self, state: Tensor, tasks: Tensor, latent: Tensor | None, env_state: Tensor | None = None
@@ -88,12 +108,12 @@ class LatentPolicy(MultiTaskPolicy):
         Returns:
             [latent, one-hot task, scaled proprioception, scaled full state], (B, O).
         """
-        parts = [tasks, self.state_scaling(state)]
+        inputs = [tasks, self.state_scaling(state)]
         if latent is not None:
-            parts.insert(0, self.latent_scaling(latent) if self.config.scales_latents else latent)
+            inputs.insert(0, self.latent_scaling(latent) if self.config.scales_latents else latent)
         if env_state is not None:
-            parts.append(self.env_state_scaling(env_state))
-        return torch.cat(parts, dim=-1)
+            inputs.append(self.env_state_scaling(env_state))
+        return torch.cat(inputs, dim=-1)
 
     def observation_at(self, batch: dict[str, Any], tasks: Tensor, t: int | None = None) -> Tensor:
         """`observation` from a training batch.
@@ -117,44 +137,13 @@ class LatentPolicy(MultiTaskPolicy):
             frame(OBS_ENV_STATE) if self.config.use_environment_state else None,
         )
 
-    def training_inputs(self, batch: dict[str, Any]) -> tuple[Tensor, ...]:
-        """What the loss is taken of, from a training batch: a row for each of its samples, (B, ...) each."""
-        raise NotImplementedError
-
-    def loss(self, *inputs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The scalar loss of some rows of `training_inputs`, and its parts by name: detached scalars."""
-        raise NotImplementedError
-
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
-        """The loss of a training batch, as `training_inputs` describes it.
-
-        Returns:
-            The scalar loss and its parts by name.
-
-        Raises:
-            ValueError: In training, with several updates in a step: `lerobot-wm train` makes them, in this one's place.
-        """
-        if self.training and self.config.updates_per_step > 1:
-            raise ValueError(
-                f"--policy.updates_per_step={self.config.updates_per_step} is for lerobot-wm train, which takes the "
-                "flags of lerobot-train: train by it, or leave the flag out (of a policy that was trained with it: "
-                "--policy.updates_per_step=1)."
-            )
-        loss, parts = self.loss(*self.training_inputs(batch))
-        return loss, logged(parts)
-
     def reset(self) -> None:
-        """Forget the episode: the next call of `select_action` starts the filter anew."""
+        """Forget the episode: the next call of `select_action` starts a new filter."""
         super().reset()
         self._filter_state: LatentState | None = None
         self._prev_action: Tensor | None = None
-        # What lerobot-eval gathers after every step and joins along dim 2, with `save_predicted_video`.
+        # With `save_predicted_video`, lerobot-eval collects this after every step and joins it along dim 2.
         self.last_predicted_latents: Tensor | None = None
-
-    def act(self, state: Tensor, tasks: Tensor, latent: Tensor | None, env_state: Tensor | None) -> Tensor:
-        """The policy's mean action, clipped to the dataset's range, in its units: (B, A). Arguments: `observation`."""
-        mean = self.actor_mean(self.observation(state, tasks, latent, env_state))
-        return self.action_scaling.inverse(mean.clamp(-1, 1))
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
@@ -169,17 +158,16 @@ class LatentPolicy(MultiTaskPolicy):
             Actions in the dataset's units, (B, A).
 
         Raises:
-            ValueError: A camera is missing or has another size than in training, the task is unknown, or a
-                state is missing.
+            ValueError: A camera or a state is missing or has another size than in training, or the task is unknown.
         """
         if self.training:  # no dropout, as LeRobot's policies act
             self.eval()
         check_observation(self.config, batch)
         state = batch[OBS_STATE]
         latent = self._filter(batch) if self.config.use_latent else None
-        env_state = self._env_state(batch) if self.config.use_environment_state else None
+        env_state = batch[OBS_ENV_STATE] if self.config.use_environment_state else None
         tasks = self.one_hot_tasks(batch, state.shape[0])
-        self._prev_action = self.with_noise(self.act(state, tasks, latent, env_state), batch)
+        self._prev_action = self.act(self.observation(state, tasks, latent, env_state), batch)
         return self._prev_action
 
     def decode_predicted_latents(self, frames: Tensor) -> Tensor:
@@ -188,13 +176,13 @@ class LatentPolicy(MultiTaskPolicy):
 
     def _filter(self, batch: dict[str, Any]) -> Tensor:
         """Advance the filter by one frame and return s_t, (B, L)."""
-        images = camera_images(self.config, batch)  # (B, C, H, W)
-        # LeRobot gives no batch size at reset: the state is made when the first frame shows it.
+        images = camera_images(batch, self.config.cameras, self.config.image_size)  # (B, C, H, W)
+        # LeRobot gives no batch size at reset, so the state is made when the first frame shows it.
         if self._prev_action is None or self._prev_action.shape[0] != images.shape[0]:
             self._filter_state = None
             self._prev_action = images.new_zeros(images.shape[0], self.config.action_dim)
-        # In float32, whatever evaluates: so are the latents that the policy was trained on. (On a GPU LeRobot's own
-        # loops have its products computed in TF32, which ours do not.)
+        # In float32 even under autocast, as the latents that the policy was trained on. (On a GPU, LeRobot's own loops
+        # compute float32 products in TF32; ours do not.)
         with torch.autocast(images.device.type, enabled=False):
             states = self.world_model.observe(
                 images[:, None], self._prev_action[:, None], self._filter_state, batch[OBS_STATE][:, None]
@@ -206,9 +194,9 @@ class LatentPolicy(MultiTaskPolicy):
         return self._filter_state.latent
 
     def _expected_and_seen(self, expected: Tensor, images: Tensor) -> Tensor:
-        """What the world model expected to see, and on its right what it saw.
+        """What the world model expected to see, and to its right what it saw.
 
-        They are pictures already: one of LeRobot's videos shows a whole batch, and it decodes latents alone.
+        They are decoded already: one of LeRobot's videos shows a whole batch, while it would decode single latents.
 
         Args:
             expected: Its `expected_images`, (B, K·C, H, W) in [0, 1].
@@ -222,6 +210,27 @@ class LatentPolicy(MultiTaskPolicy):
         grid = make_grid(pairs, nrow=math.ceil(pairs.shape[0] ** 0.5))  # (C, H', W')
         return (255 * grid).round().byte()[None, :, None]
 
-    def _env_state(self, batch: dict[str, Any]) -> Tensor:
-        self.config.check_environment_state(batch)
-        return batch[OBS_ENV_STATE]
+
+type EncoderPolicy = WorldModelPolicy | LatentPolicy
+
+
+def load_encoder(path: str) -> EncoderPolicy:
+    """Load a checkpoint with a world model, which is the policy's `world_model`.
+
+    Args:
+        path: Folder of a checkpoint of wm_rssm, frozen_backbone or another world model's type, or of a policy on
+            latents, which contains its world model; or its Hub id: user/name, or user/name@revision.
+
+    Raises:
+        FileNotFoundError: A file of the checkpoint is missing.
+        CheckpointError: It is damaged, or holds no world model.
+    """
+    open_world_model(path)
+    name, revision = split_revision(path)
+    config = read_config(name, revision)
+    return get_policy_class(config.type).from_pretrained(name, config=config, revision=revision)
+
+
+def encoder_fingerprint(model: LatentModel, **further: Any) -> str:
+    """Hash of an encoder's weights and `encoding_settings`, and of what else (`further`) decides its latents."""
+    return weights_fingerprint(model, {**model.encoding_settings, **further})

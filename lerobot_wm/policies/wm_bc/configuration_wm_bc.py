@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_wm.policies.common.lr_decay import LRDecayConfig
 from lerobot_wm.policies.latent.config import LatentPolicyConfig
 
 
 @PreTrainedConfig.register_subclass("wm_bc")
 @dataclass
-class WMBCConfig(LRDecayConfig, LatentPolicyConfig):
+class WMBCConfig(LatentPolicyConfig):
     """Two-layer MLP regressed on the demonstrated actions (paper section 3.1.2)."""

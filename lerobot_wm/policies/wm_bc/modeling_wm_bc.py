@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION, OBS_STATE
@@ -17,20 +18,26 @@ class WMBCPolicy(LatentPolicy):
 
     config_class = WMBCConfig
     name = "wm_bc"
+    config: WMBCConfig
 
-    def __init__(self, config: WMBCConfig, *args: Any, **kwargs: Any) -> None:
-        super().__init__(config, *args, **kwargs)
+    def build(self) -> None:
+        """Make the world model and the actor."""
+        super().build()
+        config = self.config
         self.actor = MLP(
             config.observation_dim, config.hidden_dims, config.action_dim, nn.ReLU, config.dropout
         )
-        if config.compile_model:
+
+    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Compile the loss, with `compile_model`."""
+        if self.config.compile_model:
             self.loss = compiled(self.loss)  # type: ignore[method-assign]
 
     def get_optim_params(self) -> dict:
         """The actor's parameters: the world model is frozen."""
-        return list(self.actor.parameters())  # type: ignore[return-value]
+        return list(self.actor.parameters())  # type: ignore[return-value]  # LeRobot's annotation is narrower than its use
 
-    def heads(self) -> list[MLP]:
+    def observation_networks(self) -> list[MLP]:
         """The actor."""
         return [self.actor]
 
@@ -38,20 +45,19 @@ class WMBCPolicy(LatentPolicy):
         """The regressed action (B, A) for observations (B, O)."""
         return self.actor(observation)
 
-    def training_inputs(self, batch: dict[str, Any]) -> tuple[Tensor, ...]:
-        """What the loss is taken of.
+    def compute_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean squared error on a batch of frames.
 
         Args:
             batch: `observation.latent` (B, L), `observation.state` (B, P), `action` (B, A), `task` (B strings), and
                 `observation.environment_state` (B, F) with `use_environment_state`.
 
         Returns:
-            Observations (B, O) and scaled actions (B, A).
+            The scalar loss, which has no parts.
         """
         tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
-        return self.observation_at(batch, tasks), self.action_scaling(batch[ACTION])
+        return self.loss(self.observation_at(batch, tasks), self.action_scaling(batch[ACTION])), {}
 
-    def loss(self, *inputs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean squared error of frames, and no parts: the loss is all there is."""
-        observation, action = inputs
-        return bc_loss(self.actor(observation), action), {}
+    def loss(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Mean squared error of the actions on observations (B, O), given scaled actions (B, A)."""
+        return bc_loss(self.actor(observation), action)

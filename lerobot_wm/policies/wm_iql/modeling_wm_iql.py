@@ -8,7 +8,7 @@ from torch import Tensor
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.config import compiled
-from lerobot_wm.policies.common.iql_agent import Outcomes, make_agent
+from lerobot_wm.policies.common.iql import RewardsAndEnds, make_agent
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 
@@ -20,32 +20,36 @@ class WMIQLPolicy(LatentPolicy):
     name = "wm_iql"
     config: WMIQLConfig
 
-    def __init__(
-        self,
-        config: WMIQLConfig,
-        dataset_stats: dict[str, dict[str, Any]] | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-    ) -> None:
-        super().__init__(config, dataset_stats, dataset_meta)
-        self.agent = make_agent(config, config.observation_dim, anew=dataset_stats is not None)
+    def build(self) -> None:
+        """Make the world model and the agent."""
+        super().build()
+        config = self.config
+        self.agent = make_agent(
+            config.iql, config.observation_dim, config.action_dim, config.hidden_dims, config.dropout
+        )
+        self.rewards_and_ends = RewardsAndEnds(config)
+
+    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Read rewards and ends from the dataset's columns; compile the loss, with `compile_model`."""
+        config = self.config
+        self.rewards_and_ends = RewardsAndEnds(config, dataset_meta)
         if config.compile_model:
             self.agent.loss = compiled(self.agent.loss)  # type: ignore[method-assign]
-        self.outcomes = Outcomes(config, dataset_meta)
 
     def get_optim_params(self) -> dict:
         """The agent's three groups, the actors first: the world model is frozen."""
         return self.agent.param_groups()  # type: ignore[return-value]  # LeRobot's annotation is narrower than its use
 
-    def heads(self) -> list[MLP]:
+    def observation_networks(self) -> list[MLP]:
         """The agent's networks."""
         return self.agent.networks()
 
     def actor_mean(self, observation: Tensor) -> Tensor:
         """Mean of the policy's Gaussian (B, A) for observations (B, O)."""
-        return self.agent.mean_action(observation, self.config.beta)
+        return self.agent.mean_action(observation, self.config.iql.beta)
 
-    def training_inputs(self, batch: dict[str, Any]) -> tuple[Tensor, ...]:
-        """What the losses are taken of.
+    def compute_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Value, critic and actor losses on a batch of transitions.
 
         Args:
             batch: `observation.latent` (B, 2, L) and `observation.state` (B, 2, P) at t and t+1,
@@ -53,16 +57,14 @@ class WMIQLPolicy(LatentPolicy):
                 `task` (B strings), and `observation.environment_state` (B, 2, F) with `use_environment_state`.
 
         Returns:
-            The arguments of `IQLAgent.loss`.
+            The sum of the losses, and its parts by name.
         """
         tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
         now, following = (self.observation_at(batch, tasks, t) for t in (0, 1))  # (B, O) each
-        return now, following, self.action_scaling(batch[ACTION]), *self.outcomes(batch)
-
-    def loss(self, *inputs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Value, critic and actor losses of transitions: their sum, and its parts by name."""
-        return self.agent.loss(*inputs)
+        return self.agent.loss(
+            now, following, self.action_scaling(batch[ACTION]), *self.rewards_and_ends(batch)
+        )
 
     def update(self) -> None:
-        """Move the target critics; called after every optimizer step."""
+        """Move the target critics; LeRobot calls this after every optimizer step."""
         self.agent.update_target()

@@ -4,56 +4,55 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
 from lerobot_wm.nn.conv import IMAGE_SIZE
-from lerobot_wm.policies.common.config import CompileConfig
-from lerobot_wm.policies.common.features import feature_dim, training_dtype
-from lerobot_wm.policies.common.lr_decay import LRDecayConfig
+from lerobot_wm.policies.common.config import feature_dim
+from lerobot_wm.policies.common.iql import reward_columns
 from lerobot_wm.policies.common.optim import FusedAdamConfig
-from lerobot_wm.policies.common.rewards import RewardConfig
 from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.world_model.config import RSSMConfig
 
 
 @PreTrainedConfig.register_subclass("wm_rssm")
 @dataclass
-class WMRSSMConfig(LRDecayConfig, CompileConfig, WorldModelConfig, RewardConfig):
+class WMRSSMConfig(WorldModelConfig):
     """The paper's RSSM, trained on windows of images and actions (section 3.1.1).
 
-    Several cameras are one image of more channels to it. Its error is summed over them all, so that each camera adds
-    to the weight of the image against the KL.
+    Several cameras are one image with more channels. Its error is summed over all of them, so each camera adds to the
+    weight of the image against the KL.
 
     Args:
         rssm: Sizes and loss weights; its input sizes are filled from the dataset.
-        window_length: Steps per training window T. A window starts at any frame from a zero state.
+        reward_key: The dataset's column that is the reward; without next.reward in the dataset, none is learned.
+        window_length: Steps per training window T. A window starts at any frame, from a zero state.
         lr: Learning rate of Adam.
         grad_clip_norm: Joint gradient norm above which gradients are scaled down.
-        dtype: Autocast type of training, "bfloat16" or "float32"; None picks what the device is fast in, once: a
-            checkpoint keeps it.
     """
 
     predicts_images: ClassVar[bool] = True
     scales_latents: ClassVar[bool] = False
 
-    rssm: RSSMConfig = field(default_factory=RSSMConfig)
-    window_length: int = 25
     lr: float = 6e-4
+    rssm: RSSMConfig = field(default_factory=RSSMConfig)
+    reward_key: str = REWARD
+    window_length: int = 25
     grad_clip_norm: float = 100.0
-    dtype: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.window_length < 2:
-            raise ValueError(f"window_length is {self.window_length}; a window needs at least 2 steps.")
-        self.dtype = training_dtype(self.dtype, str(self.device))
-        self.drop_n_last_frames = self.window_length - 1  # no setting: read by LeRobot's sampler
+            raise ValueError(f"--policy.window_length={self.window_length}: expected at least 2 steps.")
+        # Not a setting: LeRobot's sampler reads it.
+        self.drop_n_last_frames = self.window_length - 1
 
     def fit_windows(self, shortest_episode: int) -> None:
-        """Have LeRobot's sampler start windows in every episode, however short.
+        """Let LeRobot's sampler start windows in every episode, including those shorter than a window.
 
-        It leaves out the last frames of each: as many as keep windows within their episodes, or fewer where the
-        shortest is shorter than a window. Then windows run past the end of the others too; padding counts for nothing.
+        The sampler leaves out the last frames of each episode. These are as many as keep windows within their episodes,
+        or fewer where the shortest episode is shorter than a window. Windows then run past the end of the others too;
+        the loss leaves this padding out.
         """
         self.drop_n_last_frames = min(self.window_length, shortest_episode) - 1
 
@@ -87,11 +86,35 @@ class WMRSSMConfig(LRDecayConfig, CompileConfig, WorldModelConfig, RewardConfig)
         """The model's own size."""
         return IMAGE_SIZE, IMAGE_SIZE
 
-    def validate_features(self) -> None:
-        """Choose the cameras and fill the model's input sizes from the dataset's features.
+    def has_reward(self, dataset_meta: LeRobotDatasetMetadata) -> bool:
+        """Whether the dataset has a reward to predict.
 
         Raises:
-            ValueError: The cameras cannot be used, there is no action, or sizes are unlike the checkpoint's.
+            ValueError: It lacks the column that was asked for.
+        """
+        known = reward_columns(dataset_meta)
+        if self.reward_key not in known and self.reward_key != REWARD:
+            raise ValueError(
+                f"--policy.reward_key={self.reward_key}: {dataset_meta.repo_id} has no such column. Its columns with "
+                f"one number per frame are {', '.join(known) or 'none'}: name one of these, or {REWARD}, without which "
+                "no reward is learned."
+            )
+        return self.reward_key in known
+
+    def check_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Check that a reward that was asked for is there."""
+        self.has_reward(dataset_meta)
+
+    def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Forget the input sizes, and leave out the reward head where there is no reward."""
+        self.rssm.action_dim = self.rssm.image_channels = self.rssm.proprio_dim = 0
+        self.rssm.predict_reward &= self.has_reward(dataset_meta)
+
+    def validate_features(self) -> None:
+        """Choose the cameras and fill the model's input sizes from the features.
+
+        Raises:
+            ValueError: The cameras cannot be used, there is no action, or sizes differ from the checkpoint's.
         """
         super().validate_features()
         sizes = {
@@ -104,7 +127,7 @@ class WMRSSMConfig(LRDecayConfig, CompileConfig, WorldModelConfig, RewardConfig)
             known = getattr(self.rssm, name)
             if known not in (0, size):
                 raise ValueError(
-                    f"This world model was made for {name} {known}, here it is {size}: use the kind of dataset or "
+                    f"This world model was built for {name} {known}, here it is {size}: use the kind of dataset or "
                     "environment it was trained on, or train another world model."
                 )
             setattr(self.rssm, name, size)

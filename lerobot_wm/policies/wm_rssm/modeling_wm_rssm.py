@@ -1,4 +1,4 @@
-"""The world model as a LeRobot policy: `forward` is its training loss on windows."""
+"""The world model as a LeRobot policy: `compute_loss` is its training loss on windows."""
 
 from typing import Any
 
@@ -7,11 +7,11 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import load_stats
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
-from lerobot_wm.policies.common.cameras import camera_images
+from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.nn.images import camera_images
 from lerobot_wm.policies.common.config import compiled
-from lerobot_wm.policies.common.features import logged, stat
-from lerobot_wm.policies.common.rewards import FrameLabel, reward_columns
+from lerobot_wm.policies.common.iql import FrameColumn
+from lerobot_wm.policies.common.policy import Statistics, statistics
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.world_model.policy import WorldModelPolicy
 from lerobot_wm.world_model.model import WorldModel
@@ -25,55 +25,36 @@ class WMRSSMPolicy(WorldModelPolicy):
     config: WMRSSMConfig
     world_model: WorldModel
 
-    def __init__(
-        self,
-        config: WMRSSMConfig,
-        dataset_stats: dict[str, dict[str, Any]] | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-    ) -> None:
-        if dataset_stats is not None:  # made new: settings of another world model hold its sizes
-            config.rssm.action_dim = config.rssm.image_channels = config.rssm.proprio_dim = 0
-        made_new = config.rssm.action_dim == 0
-        super().__init__(config, dataset_stats, dataset_meta)
-        self._learns_reward = config.rssm.predict_reward
-        if dataset_meta is not None:  # to be trained
-            config.fit_windows(min(dataset_meta.episodes["length"]))
-            if not self._has_reward(dataset_meta):
-                self._learns_reward = False
-                if made_new:
-                    config.rssm.predict_reward = False  # without the head; a checkpoint's stays as it was
-        self.rewards = FrameLabel(config.reward_key, dataset_meta)
-        self.world_model = WorldModel(config.rssm)
-        # Only to be trained: a filter's episodes have all kinds of lengths, and each would be compiled anew.
-        if config.compile_model and dataset_meta is not None:
+    def build(self) -> None:
+        """Make the world model."""
+        self.world_model = WorldModel(self.config.rssm)
+        self.rewards = FrameColumn(self.config.reward_key)
+        self._learns_reward = self.config.rssm.predict_reward
+
+    def fit_dataset(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Set the scalings."""
+        model, config = self.world_model, self.config
+        model.action_scaling.set_range(*statistics(stats, ACTION, "min", "max"))
+        if config.rssm.use_proprio:
+            model.proprio_scaling.set_standard(*statistics(stats, OBS_STATE, "mean", "std"))
+        if config.rssm.standardize_images:
+            # By default LeRobot replaces the cameras' statistics in memory with ImageNet's: read the dataset's own.
+            own = load_stats(dataset_meta.root) or {}
+            by_camera = [statistics(own, key, "mean", "std") for key in config.cameras]
+            model.image_scaling.set_standard(*map(torch.cat, zip(*by_camera, strict=True)))
+
+    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Read rewards from the dataset's column where there is one, fit windows to its episodes, and compile."""
+        config = self.config
+        config.fit_windows(min(dataset_meta.episodes["length"]))
+        self._learns_reward = config.rssm.predict_reward and config.has_reward(dataset_meta)
+        self.rewards = FrameColumn(config.reward_key, dataset_meta if self._learns_reward else None)
+        # Only for training: a filter's episodes have many lengths, and each would be compiled separately.
+        if config.compile_model:
             rssm = self.world_model.rssm
             rssm.observe = compiled(rssm.observe)  # type: ignore[method-assign]
-        if dataset_stats is not None:  # made new: a checkpoint has its own
-            self.world_model.action_scaling.set_range(
-                stat(dataset_stats, ACTION, "min"), stat(dataset_stats, ACTION, "max")
-            )
-            if config.rssm.use_proprio:
-                self.world_model.proprio_scaling.set_standard(
-                    stat(dataset_stats, OBS_STATE, "mean"), stat(dataset_stats, OBS_STATE, "std")
-                )
-            if config.rssm.standardize_images:
-                # LeRobot lays ImageNet's statistics over the cameras' in memory, by default: read their own.
-                own = dataset_stats if dataset_meta is None else load_stats(dataset_meta.root)
-                self.world_model.image_scaling.set_standard(
-                    *(torch.cat([stat(own, key, name) for key in config.cameras]) for name in ("mean", "std"))
-                )
 
-    def _has_reward(self, dataset_meta: LeRobotDatasetMetadata) -> bool:
-        """Whether there is a reward to predict; a column that was asked for must be there."""
-        key, known = self.config.reward_key, reward_columns(dataset_meta)
-        if key not in known and key != REWARD:
-            raise ValueError(
-                f"--policy.reward_key={key}: {dataset_meta.repo_id} has no such column; of one number per frame it has "
-                f"{', '.join(known) or 'none'}. Name one of these, or {REWARD}: where that is missing, none is learned."
-            )
-        return key in known
-
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+    def compute_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """The world-model loss on a batch of windows.
 
         Args:
@@ -81,14 +62,13 @@ class WMRSSMPolicy(WorldModelPolicy):
                 `next.reward` (B, T) or `index` (B,), `observation.state` (B, T, P) where the configuration uses them.
 
         Returns:
-            The scalar loss and its parts by name.
+            The scalar loss, and its parts by name.
         """
-        rssm = self.config.rssm
-        loss, parts = self.world_model.loss(
-            images=camera_images(self.config, batch),
+        config = self.config
+        return self.world_model.loss(
+            images=camera_images(batch, config.cameras, config.image_size),
             actions=batch[ACTION],
             valid=~batch[f"{ACTION}_is_pad"],
             rewards=self.rewards(batch, batch[ACTION].shape[1]) if self._learns_reward else None,
-            proprio=batch[OBS_STATE] if rssm.use_proprio else None,
+            proprio=batch[OBS_STATE] if config.rssm.use_proprio else None,
         )
-        return loss, logged(parts)

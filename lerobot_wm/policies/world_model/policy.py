@@ -1,37 +1,25 @@
-"""A world model, or what stands in its place, as a LeRobot policy type."""
+"""A world model, or an encoder in its place, as a LeRobot policy type."""
 
 from typing import Any, NoReturn
 
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
-from lerobot_wm.policies.common.features import check_has_stats
-from lerobot_wm.policies.common.policy import StrictPolicy
+from lerobot_wm.policies.common.policy import BasePolicy
 from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.world_model.interface import LatentModel
 
 
-class WorldModelPolicy(StrictPolicy):
-    """Base of the types that make latents and have no actions: `wm_bc` and `wm_iql` act on them.
+class WorldModelPolicy(BasePolicy):
+    """Base of the types that make latents and choose no actions: `wm_bc` and `wm_iql` act on them.
 
-    Subclasses set `world_model` when they are made, from the configuration alone, and define `forward`, its training
-    loss. A policy on its latents holds that module; what else a subclass has (decoders, targets) only serves training.
+    `build` of a subclass sets `world_model`, and `compute_loss` is its training loss. A policy on the latents holds
+    that module; what else a subclass has (decoders, targets) only serves training.
     """
 
     config_class = WorldModelConfig
     name = "world_model"
     config: WorldModelConfig
     world_model: LatentModel
-
-    def __init__(
-        self,
-        config: WorldModelConfig,
-        dataset_stats: dict[str, dict[str, Any]] | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-    ) -> None:
-        super().__init__(config)
-        check_has_stats(dataset_meta)
-        config.validate_features()
 
     def get_optim_params(self) -> dict:
         """Every parameter."""

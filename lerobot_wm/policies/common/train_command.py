@@ -27,7 +27,7 @@ _FILLED_IN = {
     "policy.rssm.proprio_dim",
     "policy.world_model",
     "policy.world_model_fingerprint",
-    "policy.trained_betas",
+    "policy.iql.trained_betas",
 }
 # The machine's, the Hub's, and what is noted, kept and evaluated on the way: not of what is learned.
 _NO_MATTER = {

@@ -1,6 +1,5 @@
-"""The model card of our policy types: what it is, how it was trained, how well it does, how to use it."""
+"""The model card of our policy types: what it is, how it was trained, how well it works, how to use it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -8,9 +7,10 @@ from typing import Self
 
 import draccus
 from huggingface_hub import ModelCard, ModelCardData
-from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies.factory import get_policy_class
 
 from lerobot_wm.constants import (
     ACTION,
@@ -26,20 +26,21 @@ from lerobot_wm.constants import (
 from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
 from lerobot_wm.envs.cameras import CAMERAS
 from lerobot_wm.envs.tasks import all_tasks, task_description
-from lerobot_wm.hub.train_command import train_command
 from lerobot_wm.markdown import Markdown, render
+from lerobot_wm.policies.common.config import PolicyConfig
+from lerobot_wm.policies.common.train_command import train_command
 
 
-def eval_command(config: PreTrainedConfig, repo_id: str) -> str:
-    """In Meta-World, with its tasks and cameras, if it knows no other; else in an environment to be filled in.
+def eval_command(config: PolicyConfig, repo_id: str) -> str:
+    """The command that evaluates an acting policy, in Meta-World if it has all its tasks and cameras.
 
     Args:
-        config: Of a policy that acts.
+        config: The policy's configuration.
         repo_id: Where it is published.
     """
     tasks = _metaworld_tasks(getattr(config, "tasks", []))
     images = [key for key, feature in config.input_features.items() if feature.type is FeatureType.VISUAL]
-    # A single camera's key does not tell which it is: the environment's own default is taken.
+    # The key of a single camera does not say which one it is: the environment uses its default.
     cameras = [key.removeprefix(f"{OBS_IMAGES}.") for key in images if key != OBS_IMAGE]
     if tasks is None or not set(cameras) <= set(CAMERAS):
         return f"lerobot-eval --policy.path={repo_id} --env.type=ENVIRONMENT --eval.n_episodes=50 --seed=0"
@@ -53,8 +54,8 @@ def eval_command(config: PreTrainedConfig, repo_id: str) -> str:
 
 
 def _metaworld_tasks(descriptions: list[str]) -> str | None:
-    """The tasks' names, or their set's, as `--env.task` takes them; None where one is not Meta-World's."""
-    # Of two tasks that share a description, the first.
+    """The names of the tasks, or of their set, for `--env.task`; None if one is not Meta-World's."""
+    # The first of two tasks that share a description.
     names = {task_description(name): name for name in reversed(all_tasks())}
     if not descriptions or not set(descriptions) <= set(names):
         return None
@@ -71,16 +72,16 @@ IMAGINATION = "imagination.webp"  # beside the card, where there is one
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a card says of the dataset a policy was trained on.
+    """What a card says about the dataset that a policy was trained on.
 
     Attributes:
         repo_id: Its name.
-        episodes, frames: How many.
-        fps: Frames a second.
-        robot_type: What it was recorded on, as LeRobot names it; None where it does not say.
+        episodes, frames: Their numbers.
+        fps: Frames per second.
+        robot_type: The robot it was recorded on, as LeRobot names it; None where it does not say.
         tasks: Its task strings.
-        fingerprint: `dataset_fingerprint` of it.
-        latents: Their record, where it holds latents.
+        fingerprint: Its `dataset_fingerprint`.
+        latents: Their record, in a dataset of latents.
     """
 
     repo_id: str
@@ -109,31 +110,26 @@ class TrainingData:
 
 
 def model_card(
-    policy_class: type,
-    config: PreTrainedConfig,
+    config: PolicyConfig,
     repo_id: str,
     cfg: TrainPipelineConfig | None,
     data: TrainingData | None,
     results: str | None = None,
     imagined_tasks: list[str] | None = None,
-    *,
-    features_read: Sequence[str],
-    makes_latents: bool,
 ) -> ModelCard:
     """Write the card.
 
     Args:
-        policy_class: Of the policy.
-        config: Its configuration.
+        config: The policy's configuration.
         repo_id: Where it is published.
-        cfg: Of the run that trained it; None where that is not known.
+        cfg: The configuration of the run that trained it; None where that is unknown.
         data: What it was trained on; None where that is not on this machine.
         results: Tables of an evaluation, in Markdown.
         imagined_tasks: What the columns of `IMAGINATION` show, which is published with the card; None where there is
             no such file.
-        features_read: Keys of the inputs it reads; a world model's configuration keeps all that its dataset has.
-        makes_latents: Whether it is a world model, or what stands in its place, and not a policy that acts.
     """
+    policy_class = get_policy_class(config.type)
+    makes_latents = not config.chooses_actions
     settings = draccus.encode(config)
     datasets = [data.latents.source_repo_id if data.latents else data.repo_id] if data else None
     metadata = ModelCardData(
@@ -154,7 +150,7 @@ def model_card(
         example=Markdown(_example(config, settings)),
         evaluation=None if makes_latents else Markdown(eval_command(config, repo_id)),
         action_shape=(1, *config.output_features[ACTION].shape),
-        inputs={key: tuple(config.input_features[key].shape) for key in features_read},
+        inputs={key: tuple(config.input_features[key].shape) for key in config.features_read},
         run=cfg,
         command=Markdown(train_command(cfg, data.latents if data else None)) if cfg else None,
         data=data,
@@ -166,7 +162,7 @@ def model_card(
     return ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n{body}")
 
 
-def _example(config: PreTrainedConfig, settings: dict) -> str:
+def _example(config: PolicyConfig, settings: dict) -> str:
     """A line of Python that makes inputs of the right shapes."""
     if config.type == "wm_rssm":
         rssm = settings["rssm"]
