@@ -86,7 +86,7 @@ def test_every_command_line_is_understood(tmp_path: Path) -> None:
     parsed = {name: parse(stages[name].argv) for name in distinct.values()}
     assert {stages[name].argv[3] for name in parsed} == set(CONFIGS) - {"report"}
 
-    assert parsed["seed_0/wm_iql_sweep"].policy.sweep_betas == [0, 3, 10]
+    assert parsed["seed_0/wm_iql_sweep"].policy.iql.sweep_betas == [0, 3, 10]
     assert parsed["seed_0/wm_rssm_proprio"].policy.rssm.use_proprio
     assert parsed["seed_0/state_bc"].policy.use_environment_state
     assert not parsed["seed_0/proprio_bc"].policy.use_latent

@@ -80,7 +80,7 @@ def load_preset(name: str, configs: Path = CONFIGS) -> Preset:
         )
     for table, names in (("arms", ARMS), ("trainings", TRAININGS)):
         for pattern in data[table]:
-            if not any(fnmatchcase(name, pattern) for name in names):
+            if not any(fnmatchcase(known, pattern) for known in names):
                 raise ValueError(f"{path}: '{pattern}' in '{table}' matches none of {', '.join(names)}.")
     data["arms"] = {arm: seeds[-1] for arm in ARMS if (seeds := _matching(data["arms"], arm))}
     trainings = {}
