@@ -161,7 +161,7 @@ class BasePolicy(PreTrainedPolicy):
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
         file = Path(model_file)
         if not file.is_file():
-            raise FileNotFoundError(f"{file}, the weights of the checkpoint, is missing: {WHOLE}.")
+            raise FileNotFoundError(f"{file} is missing: {WHOLE}.")
         try:
             model = super()._load_as_safetensor(model, model_file, map_location, strict)
         except SafetensorError as error:
