@@ -166,8 +166,9 @@ def _begin(
             if LatentRecord.read(output_root) == _record(policy, source, rename_map, sample_seed):
                 shutil.rmtree(parts, ignore_errors=True)  # left by a run killed at its very end
         raise FileExistsError(f"{output_root} is there already: choose another --output_root, or remove it.")
-    # Of a policy on latents, what its world model reads.
+    # Of a policy on latents, only what its world model reads.
     model = policy.config.world_model if isinstance(policy, LatentPolicy) else policy.config
+    assert model is not None  # `load_encoder` takes no policy without
     check_reads(model, source.meta, rename_map)
     [state] = names_before([OBS_STATE], rename_map)
     if state not in source.meta.features:

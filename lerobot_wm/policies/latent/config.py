@@ -128,7 +128,8 @@ class LatentPolicyConfig(PolicyConfig):
             )
         self.world_model = open_world_model(self.world_model_path)
         self.image_key = self.world_model.image_key
-        self.input_features |= {key: self.world_model.input_features[key] for key in self.world_model.cameras}
+        for key in self.world_model.cameras:
+            self.input_features[key] = self.world_model.input_features[key]
 
     def check_unchanged(self, saved: "LatentPolicyConfig") -> None:  # type: ignore[override]
         """Also check that the world model is the checkpoint's."""
