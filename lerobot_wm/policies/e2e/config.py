@@ -76,4 +76,4 @@ class E2EConfig(PolicyConfig):
         self.choose_cameras()
         self.encoder_image_size = self.image_size
         _ = self.state_dim, self.action_dim
-        self.input_features = {key: self.input_features[key] for key in (*self.cameras, OBS_STATE)}
+        self.remove_inputs(self.input_features.keys() - {*self.cameras, OBS_STATE})

@@ -103,10 +103,10 @@ class LatentPolicyConfig(PolicyConfig):
         if self.use_latent and self.world_model is None:
             self._take_world_model()
         read = {OBS_STATE, *self.cameras, OBS_ENV_STATE if self.use_environment_state else None}
-        inputs = {key: feature for key, feature in self.input_features.items() if key in read}
-        if OBS_STATE not in inputs or inputs[OBS_STATE].type is not FeatureType.STATE:
+        state = self.input_features.get(OBS_STATE)
+        if state is None or state.type is not FeatureType.STATE:
             raise ValueError(f"The dataset has no '{OBS_STATE}'; it has {sorted(self.input_features)}.")
-        self.input_features = inputs
+        self.remove_inputs(self.input_features.keys() - read)
         _ = self.state_dim, self.env_state_dim
         model = self.world_model
         if self.save_predicted_video and (model is None or not model.predicts_images):
