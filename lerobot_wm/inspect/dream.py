@@ -138,8 +138,7 @@ def _act(policy: LatentPolicy, state: RSSMState, last: dict[str, Any], n_steps: 
     env_state = last[OBS_ENV_STATE] if policy.config.use_environment_state else None
     latents = []
     for _ in range(n_steps):
-        observation = policy.observation(last[OBS_STATE], tasks, state.latent, env_state)  # (1, O)
-        action = policy.mean_action(observation)  # (1, A)
+        action = policy.act(policy.observation(last[OBS_STATE], tasks, state.latent, env_state))  # (1, A)
         state = world_model.imagine(state, action[:, None]).last()
         latents.append(state.latent)
     return torch.stack(latents, dim=1)

@@ -138,20 +138,20 @@ WEIGHT_FAULTS: dict[str, tuple[Fault, str]] = {
         partial(change_tensors, name=WEIGHTS, change=spoil),
         f"/{WEIGHTS} holds NaN or Inf in ",
     ),
-    "weights cut short": (partial(cut, name=WEIGHTS), f"/{WEIGHTS} does not fit"),
-    "weights empty": (partial(write, name=WEIGHTS, text=""), f"/{WEIGHTS} does not fit"),
+    "weights cut short": (partial(cut, name=WEIGHTS), f"/{WEIGHTS} cannot be read"),
+    "weights empty": (partial(write, name=WEIGHTS, text=""), f"/{WEIGHTS} cannot be read"),
     "weights missing": (partial(remove, name=WEIGHTS), f"/{WEIGHTS} is missing"),
 }
 CONFIG_FAULTS: dict[str, tuple[Fault, str]] = {
     "no configuration": (partial(remove, name=CONFIG), f" has no {CONFIG}"),
-    "configuration cut short": (partial(cut, name=CONFIG), f"/{CONFIG} is no JSON"),
+    "configuration cut short": (partial(cut, name=CONFIG), f"/{CONFIG} is not JSON"),
     "configuration without a type": (
         partial(write, name=CONFIG, text="[]"),
         f"/{CONFIG} names no policy type",
     ),
     "a setting of a newer release": (
         partial(set_entry, name=CONFIG, keys=["horizon_of_2030"], value=3),
-        f"/{CONFIG} is no configuration of a ",
+        f"/{CONFIG} is not a configuration of the ",
     ),
     "a type of a newer release": (
         partial(set_entry, name=CONFIG, keys=["type"], value="wm_2030"),
@@ -159,13 +159,16 @@ CONFIG_FAULTS: dict[str, tuple[Fault, str]] = {
     ),
     "the type of another policy": (
         partial(set_entry, name=CONFIG, keys=["type"], value="act"),
-        f"/{CONFIG} is no configuration of a act",
+        f"/{CONFIG} is not a configuration of the act",
     ),
 }
 PROCESSOR_FAULTS: dict[str, tuple[Fault, str]] = {
     "no preprocessor": (partial(remove, name=PREPROCESSOR), f" has no {PREPROCESSOR}"),
     "no postprocessor": (partial(remove, name=POSTPROCESSOR), f" has no {POSTPROCESSOR}"),
-    "preprocessor cut short": (partial(cut, name=PREPROCESSOR), f"/{PREPROCESSOR} does not name every"),
+    "preprocessor cut short": (
+        partial(cut, name=PREPROCESSOR),
+        f"/{PREPROCESSOR} does not give a registry_name",
+    ),
     "statistics missing": (partial(remove, name=STATISTICS), f" has no {STATISTICS}"),
     "statistics cut short": (partial(cut, name=STATISTICS), f"/{STATISTICS} cannot be read"),
 }

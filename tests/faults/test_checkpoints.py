@@ -143,7 +143,7 @@ def test_python_refuses_a_checkpoint_of_another_type(
     policy_type: str, all_checkpoints: dict[str, Path]
 ) -> None:
     for other in set(TYPES) - {policy_type}:
-        with pytest.raises(ValueError, match=rf" is a {other}, no {policy_type}: "):
+        with pytest.raises(ValueError, match=rf" is a {other}, not a {policy_type}: "):
             load(all_checkpoints[other], policy_type)
 
 
@@ -176,7 +176,7 @@ def test_a_link_that_leads_nowhere(
     (tmp_path / "000002").mkdir()
     (tmp_path / "last").symlink_to("000004")
     line = last_line(command(way, tmp_path / "last" / "pretrained_model", demos, latents, tmp_path / "out"))
-    assert f"{tmp_path / 'last'} is a link to 000004, which is not there; {tmp_path} holds 000002. " in line
+    assert f"{tmp_path / 'last'} is a link to 000004, which does not exist; {tmp_path} holds 000002. " in line
     no_work()
 
 
@@ -189,7 +189,8 @@ def test_a_world_model_needs_no_processors(all_checkpoints: dict[str, Path], tmp
 
 
 @pytest.mark.parametrize(
-    ("name", "says"), [("wm_bc", " is no configuration of a wm_bc"), ("act", " is no confi")]
+    ("name", "says"),
+    [("wm_bc", " is not a configuration of the wm_bc"), ("act", " is not a configuration of the act")],
 )
 def test_a_configuration_of_another_type(
     name: str, says: str, checkpoints: dict[str, Path], demos: LeRobotDataset, tmp_path: Path
@@ -268,7 +269,7 @@ def test_pickles_are_never_opened(
     world_model = broken_copy(checkpoints["wm_rssm"], tmp_path / "wm", partial(plant_pickles, canary=canary))
     lerobot_wm_command(command("encode", world_model, demos, demos, tmp_path / "latents"))
     (world_model / WEIGHTS).write_bytes(pickle.dumps(Canary(canary)))
-    assert "does not fit" in last_line(command("encode", world_model, demos, demos, tmp_path / "out"))
+    assert "cannot be read" in last_line(command("encode", world_model, demos, demos, tmp_path / "out"))
     assert not canary.exists()
     pickle.loads((world_model / WEIGHTS).read_bytes())
     assert canary.exists(), "the canary would have told nothing"

@@ -61,7 +61,8 @@ def check_reads(
     """Check that a dataset has all that a trained policy or world model reads, in the sizes it was trained with.
 
     Raises:
-        ValueError: A feature is missing or has another size. Cameras may have any size, and latents stand for them.
+        ValueError: A feature is missing or has another size. Cameras may have any size, and a policy may read latents
+            instead.
     """
     keys = _vectors(config)
     missing = [key for key in names_before(keys, rename_map) if key not in dataset_meta.features]
@@ -71,7 +72,8 @@ def check_reads(
             f"{', '.join(dataset_meta.features)}. Use a dataset of the kind it was trained on, or --rename_map."
         )
     check_sizes(config, dataset_meta, rename_map)
-    if OBS_LATENT not in dataset_meta.features:
+    reads_latents = config.chooses_actions and OBS_LATENT in dataset_meta.features
+    if not reads_latents:
         cameras = [rename_map.get(key, key) for key in dataset_meta.camera_keys]
         check_cameras_present(config, cameras, dataset_meta.repo_id)
 
@@ -165,7 +167,10 @@ def dataset_cameras(config: PolicyConfig, dataset_meta: LeRobotDatasetMetadata) 
 
 def _vectors(config: PolicyConfig) -> list[str]:
     """Keys of the vectors that a trained policy reads or predicts."""
-    vectors = [key for key in config.features_read if key not in config.cameras]
+    inputs = config.input_features
+    vectors = [
+        key for key in config.features_read if key in inputs and inputs[key].type is not FeatureType.VISUAL
+    ]
     # A frozen image backbone reads no actions.
     return vectors if config.action_dim is None else [*vectors, ACTION]
 
@@ -173,8 +178,8 @@ def _vectors(config: PolicyConfig) -> list[str]:
 def _check_environment(config: PolicyConfig, env: EnvConfig, rename_map: Mapping[str, str]) -> None:
     if not config.chooses_actions:
         raise ValueError(
-            f"{config.pretrained_path} ({config.type}) makes latents and chooses no actions: train a policy on them, "
-            "--policy.type=wm_bc or wm_iql, and evaluate that."
+            f"A {config.type} makes latents and chooses no actions: train a policy on them, --policy.type=wm_bc or "
+            "wm_iql, and evaluate that. To train without evaluation, leave out --env.type or set --env_eval_freq=0."
         )
     features = renamed(env_to_policy_features(env), rename_map)
     cameras: Collection[str] = image_keys(features)

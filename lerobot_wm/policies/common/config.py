@@ -146,7 +146,11 @@ class PolicyConfig(PreTrainedConfig):
                 "the same number, separated by commas."
             )
         self.image_key = ",".join(chosen)
-        for key in set(known) - set(chosen):
+        self.remove_inputs(set(known) - set(chosen))
+
+    def remove_inputs(self, keys: Iterable[str]) -> None:
+        """Leave out features that the policy does not read."""
+        for key in keys:
             del self.input_features[key]
 
     def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:

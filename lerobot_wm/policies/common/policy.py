@@ -3,7 +3,7 @@
 import logging
 import zlib
 from collections.abc import Iterator, Mapping
-from copy import copy, deepcopy
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NoReturn, Self
 
@@ -161,7 +161,7 @@ class BasePolicy(PreTrainedPolicy):
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
         file = Path(model_file)
         if not file.is_file():
-            raise FileNotFoundError(f"{file}, the weights of the checkpoint, is missing: {WHOLE}.")
+            raise FileNotFoundError(f"{file} is missing: {WHOLE}.")
         try:
             model = super()._load_as_safetensor(model, model_file, map_location, strict)
         except SafetensorError as error:
@@ -186,10 +186,11 @@ class BasePolicy(PreTrainedPolicy):
             DivergenceError: A weight is NaN or infinite.
         """
         check_finite_weights(self, self.config)
-        super()._save_pretrained(save_directory, *args, **kwargs)
-        config = copy(self.config)
-        config.pretrained_revision = None
-        config._save_pretrained(save_directory)
+        revision, self.config.pretrained_revision = self.config.pretrained_revision, None
+        try:
+            super()._save_pretrained(save_directory, *args, **kwargs)
+        finally:
+            self.config.pretrained_revision = revision
 
     def wrap_with_peft(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Refuse adapters (`--peft.*`): LeRobot loads their base with the settings of the trained policy.
@@ -287,18 +288,12 @@ class ActingPolicy(BasePolicy):
         """Forget the episode; LeRobot calls this between episodes."""
         self._action_noise.reset()
 
-    def mean_action(self, observation: Tensor) -> Tensor:
-        """The policy's mean action for observations (B, O), clipped to the dataset's range, in its units: (B, A)."""
+    def act(self, observation: Tensor) -> Tensor:
+        """The policy's mean action, clipped to the dataset's range, in its units: (B, A) for observations (B, O)."""
         return self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))
 
-    def act(self, observation: Tensor, batch: dict[str, Any]) -> Tensor:
-        """The policy's mean action with `action_noise`, clipped to the dataset's range, in its units: (B, A).
-
-        Args:
-            observation: The networks' input, (B, O).
-            batch: What `select_action` was given.
-        """
-        action = self.mean_action(observation)
+    def with_noise(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
+        """Actions (B, A) with `action_noise`, clipped to the dataset's range; `batch` is that of `select_action`."""
         if self.config.action_noise == 0:
             return action
         noisy = self._action_noise(self.action_scaling(action), batch)  # (B, A)

@@ -64,7 +64,8 @@ class E2EConfig(PolicyConfig):
         """Take the tasks and the cameras' sizes."""
         self.tasks = task_names(dataset_meta)
         found = dataset_to_policy_features(dataset_meta.features)
-        self.input_features |= {key: found[key] for key in self.input_features.keys() & found.keys()}
+        for key in self.input_features.keys() & found.keys():
+            self.input_features[key] = found[key]
 
     def validate_features(self) -> None:
         """Choose the cameras and the image size; the inputs are then the cameras and proprioception.
@@ -75,5 +76,4 @@ class E2EConfig(PolicyConfig):
         self.choose_cameras()
         self.encoder_image_size = self.image_size
         _ = self.state_dim, self.action_dim
-        for key in self.input_features.keys() - {*self.cameras, OBS_STATE}:
-            del self.input_features[key]
+        self.remove_inputs(self.input_features.keys() - {*self.cameras, OBS_STATE})

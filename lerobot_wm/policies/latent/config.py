@@ -106,8 +106,7 @@ class LatentPolicyConfig(PolicyConfig):
         state = self.input_features.get(OBS_STATE)
         if state is None or state.type is not FeatureType.STATE:
             raise ValueError(f"The dataset has no '{OBS_STATE}'; it has {sorted(self.input_features)}.")
-        for key in self.input_features.keys() - read:
-            del self.input_features[key]
+        self.remove_inputs(self.input_features.keys() - read)
         _ = self.state_dim, self.env_state_dim
         model = self.world_model
         if self.save_predicted_video and (model is None or not model.predicts_images):
@@ -129,7 +128,8 @@ class LatentPolicyConfig(PolicyConfig):
             )
         self.world_model = open_world_model(self.world_model_path)
         self.image_key = self.world_model.image_key
-        self.input_features |= {key: self.world_model.input_features[key] for key in self.world_model.cameras}
+        for key in self.world_model.cameras:
+            self.input_features[key] = self.world_model.input_features[key]
 
     def check_unchanged(self, saved: "LatentPolicyConfig") -> None:  # type: ignore[override]
         """Also check that the world model is the checkpoint's."""

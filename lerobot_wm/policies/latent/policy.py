@@ -167,7 +167,8 @@ class LatentPolicy(ActingPolicy):
         latent = self._filter(batch) if self.config.use_latent else None
         env_state = batch[OBS_ENV_STATE] if self.config.use_environment_state else None
         tasks = self.one_hot_tasks(batch, state.shape[0])
-        self._prev_action = self.act(self.observation(state, tasks, latent, env_state), batch)
+        action = self.act(self.observation(state, tasks, latent, env_state))
+        self._prev_action = self.with_noise(action, batch)
         return self._prev_action
 
     def decode_predicted_latents(self, frames: Tensor) -> Tensor:
