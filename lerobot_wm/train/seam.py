@@ -13,11 +13,13 @@ from accelerate import Accelerator, DistributedDataParallelKwargs, PartialState
 from accelerate.data_loader import BatchSamplerShard
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.scripts import lerobot_train
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
 from lerobot_wm.data.loader import RamLoader, batches_of_rows
+from lerobot_wm.policies.common.card import TrainingData, model_card
 from lerobot_wm.policies.common.checks import check_fit, names_before
 from lerobot_wm.policies.common.config import PolicyConfig
 
@@ -44,6 +46,8 @@ def train_from_memory(cfg: TrainPipelineConfig) -> None:
         lerobot_train.train(cfg)
     finally:
         lerobot_train.make_dataloaders = make_dataloaders
+    if isinstance(cfg.policy, PolicyConfig) and cfg.policy.push_to_hub and PartialState().is_main_process:
+        _publish_card(cfg, cfg.policy)
 
 
 def start_processes(policy: PreTrainedConfig) -> PartialState:
@@ -129,3 +133,10 @@ def _check_environment(cfg: TrainPipelineConfig) -> None:
     # LeRobot has made the policy by now. Without this the run would stop at its first evaluation.
     if cfg.env is not None and cfg.env_eval_freq > 0:
         check_fit(cfg.policy, cfg.env, cfg.rename_map)
+
+
+def _publish_card(cfg: TrainPipelineConfig, policy: PolicyConfig) -> None:
+    """Replace the card that LeRobot publishes; LeRobot 0.6.1 asks the policy for one."""
+    meta = LeRobotDatasetMetadata(cfg.dataset.repo_id, root=cfg.dataset.root, revision=cfg.dataset.revision)
+    card = model_card(policy, policy.repo_id, cfg, TrainingData.of(meta))
+    card.push_to_hub(policy.repo_id)
