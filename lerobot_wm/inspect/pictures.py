@@ -21,7 +21,7 @@ def shorten(name: str) -> str:
 
 
 def figure_bytes(figure: Figure, mime_type: str) -> bytes:
-    """A matplotlib figure as a PNG or SVG file; the same figure always gives the same bytes."""
+    """A matplotlib figure as a PNG or SVG file, without a date."""
     buffer = io.BytesIO()
     for text in figure.findobj(Text):
         # The name of a task or arm may contain $.
