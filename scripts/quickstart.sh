@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# The whole path on one small machine: demonstrations, world model, latents, policies, rollouts, report; 8 to 12 minutes on
-# two cores. It is scripts/reproduce_table1.py at the sizes of configs/quickstart.json: ten rollouts of each task, on five seen
-# and five unseen variations.
+# The whole pipeline on a small machine: demonstrations, world model, latents, policies, rollouts and report. It takes 8 to
+# 12 minutes on two cores. It runs scripts/reproduce_table1.py with the sizes of configs/quickstart.json: ten rollouts of
+# each task, on five seen and five unseen variations.
 #
 # You can stop it and run it again: finished stages are skipped, training resumes from its last checkpoint. To start over,
 # remove outputs/quickstart.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-# Without bytecode files, which this variable forbids, each command spends 7 s more on its imports.
+# This variable forbids bytecode files, without which each command needs 7 s more for its imports.
 unset PYTHONDONTWRITEBYTECODE
 
 bash scripts/setup.sh

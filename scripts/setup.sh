@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# Makes the project's .venv exactly what requirements.lock says and checks that headless rendering works.
+# Installs exactly the packages in requirements.lock into .venv, and checks that headless rendering works.
 # Called by test.sh and quickstart.sh; safe to run again (about a second when nothing has changed).
 set -euo pipefail
 shopt -s inherit_errexit
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-# uv trusts its own list of certificates; a network with an inspecting proxy adds one to the system's list.
+# uv trusts its own list of certificates; a network with an inspecting proxy needs one from the system's list.
 SYSTEM_CERTIFICATES=/etc/ssl/certs/ca-certificates.crt
 if [[ -z "${SSL_CERT_FILE:-}" && -f "$SYSTEM_CERTIFICATES" ]]; then
   export SSL_CERT_FILE="$SYSTEM_CERTIFICATES"
 fi
 
-# What software EGL rendering of MuJoCo loads on Debian and Ubuntu.
+# Libraries for software rendering of MuJoCo with EGL on Debian and Ubuntu.
 GL_PACKAGES=(libegl1 libopengl0 libgl1-mesa-dri)
 
 die() {
@@ -19,7 +19,7 @@ die() {
   exit 1
 }
 
-# Installs Debian packages when run as root, and otherwise ends with the line to run.
+# Installs Debian packages if run as root; otherwise prints the command to run, and exits.
 apt_install() {
   local line="apt-get update && apt-get install -y --no-install-recommends $*"
   if [[ "$(id -u)" -ne 0 ]] || ! command -v apt-get >/dev/null; then

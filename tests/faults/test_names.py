@@ -10,13 +10,14 @@ import torch
 from huggingface_hub.errors import HFValidationError
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from safetensors.torch import save_file
 
 from lerobot_wm.collect.config import CollectConfig
 from lerobot_wm.commands.relabel import relabel
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.loader import RamDataset
 from lerobot_wm.data.source import open_dataset
-from lerobot_wm.policies.common.checkpoint import check_processors
+from lerobot_wm.policies.common.checkpoint import CheckpointError, open_checkpoint
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.records import record_line
 from lerobot_wm.report.command import ReportConfig, report
@@ -104,9 +105,12 @@ def test_names_in_the_report_are_text(tmp_path: Path) -> None:
     ],
 )
 def test_a_checkpoint_names_no_code(steps: object, tmp_path: Path) -> None:
-    (tmp_path / "policy_postprocessor.json").write_text(json.dumps({"name": "x", "steps": steps}))
-    with pytest.raises(ValueError, match="registry_name"):
-        check_processors(tmp_path, None)
+    WMRSSMConfig(device="cpu").save_pretrained(tmp_path)
+    save_file({}, tmp_path / "model.safetensors")
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (tmp_path / name).write_text(json.dumps({"name": "x", "steps": steps}))
+    with pytest.raises(CheckpointError, match="registry_name"):
+        open_checkpoint(tmp_path)
 
 
 def test_training_on_does_not_run_code_of_the_checkpoint(

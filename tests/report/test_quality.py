@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lerobot_wm.data.options import SourceConfig
+from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect import quality
 from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.report.page import template_environment
