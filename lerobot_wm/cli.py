@@ -30,7 +30,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "lerobot_wm.inspect.dream_command",
         "an episode as a world model imagines it -> video and strip",
     ),
-    "publish": ("lerobot_wm.hub.publish", "checkpoint -> the Hub, with results and a dream on its card"),
+    "publish": ("lerobot_wm.commands.publish", "checkpoint -> the Hub, with results and a dream on its card"),
     "doctor": ("lerobot_wm.commands.doctor", "check Python, GL, packages, GPU, disk and Hub login"),
 }
 

@@ -32,7 +32,6 @@ LEVELS = {
             ("train",),
             ("inspect",),
             ("report",),
-            ("hub",),
             ("commands",),
             ("experiment",),
             ("cli",),

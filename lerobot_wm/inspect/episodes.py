@@ -12,6 +12,8 @@ from torch import Tensor
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.nn.images import camera_images, resize_images
+from lerobot_wm.policies.common.checks import check_reads
+from lerobot_wm.policies.common.config import check_cameras_present
 from lerobot_wm.policies.latent.policy import LatentPolicy, load_encoder
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
@@ -64,33 +66,20 @@ def reward_key(policy: ImaginingPolicy) -> str:
     return world_model_config(policy).reward_key
 
 
-def shapes_read(policy: ImaginingPolicy) -> dict[str, tuple[int, ...]]:
-    """What the world model and the policy read from a dataset: key -> shape in training (cameras: C, H, W)."""
-    config = policy.config
-    shapes = {key: tuple(config.input_features[key].shape) for key in config.features_read}
-    return shapes | {ACTION: tuple(config.output_features[ACTION].shape)}
+def keys_read(policy: ImaginingPolicy) -> list[str]:
+    """What the world model and the policy read from a dataset."""
+    return [*policy.config.features_read, ACTION]
 
 
 def check_features(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata) -> None:
-    """Check that a dataset has what the policy reads, in the size it was trained on; images may have any size.
+    """Check that an image dataset has what the policy reads, in the size it was trained on; images may have any size.
 
     Raises:
         ValueError: A feature is missing or has another size.
     """
-    shapes = shapes_read(policy)
-    missing = [key for key in shapes if key not in meta.features]
-    if missing:
-        raise ValueError(
-            f"{meta.repo_id} has no {', '.join(missing)}; it has {', '.join(sorted(meta.features))}. Give the "
-            "--dataset.repo_id of an image dataset like the one the world model was trained on."
-        )
-    for key in shapes.keys() - policy.config.cameras:
-        found = tuple(meta.features[key]["shape"])
-        if found != shapes[key]:
-            raise ValueError(
-                f"'{key}' has shape {found} in {meta.repo_id}, but the checkpoint was trained on {shapes[key]}. Give a "
-                "dataset like the one it was trained on."
-            )
+    check_reads(policy.config, meta)
+    # `check_reads` accepts latents in place of cameras.
+    check_cameras_present(policy.config, meta.camera_keys, meta.repo_id)
 
 
 def episodes_by_task(meta: LeRobotDatasetMetadata, min_length: int = 1) -> dict[str, list[int]]:
@@ -121,10 +110,10 @@ def read_episodes(
 
     Yields:
         What the policy reads of T frames: each camera (T, C, H, W) in [0, 1] at the model's image size, `action` (T, A)
-        and the other keys of `shapes_read` (T, ·); the reward that the world model learned (T,) where the dataset has
+        and the other keys of `keys_read` (T, ·); the reward that the world model learned (T,) where the dataset has
         it; `task`, under which `episodes_by_task` counts the episode.
     """
-    keys = [*shapes_read(policy), *({reward_key(policy)} & meta.features.keys())]
+    keys = [*keys_read(policy), *({reward_key(policy)} & meta.features.keys())]
     all_lengths, tasks = meta.episodes["length"][:], meta.episodes["tasks"][:]
     lengths = [all_lengths[episode] for episode in episodes]
     times = [step / meta.fps for step in range(min(max(lengths), _FRAMES_AT_ONCE))]
@@ -156,7 +145,7 @@ def stack_episodes(policy: ImaginingPolicy, episodes: list[dict[str, Any]]) -> d
     """Stack what the policy reads of B episodes of T frames on its device: (B, T, ·) by key."""
     return {
         key: torch.stack([episode[key] for episode in episodes]).to(policy.config.device)
-        for key in shapes_read(policy)
+        for key in keys_read(policy)
     }
 
 

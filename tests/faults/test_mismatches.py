@@ -11,11 +11,11 @@ from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wm.commands.publish import PublishConfig, publish
 from lerobot_wm.data.latents import RECORD_PATH
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.encode.dataset import encode
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from lerobot_wm.hub.publish import PublishConfig, publish
 from lerobot_wm.inspect.episodes import CheckpointConfig
 from tests.faults.breakage import set_entry
 from tests.faults.checkpoints import TASKS, WEIGHTS, last_line, load, make_checkpoint, record_demos

@@ -15,9 +15,9 @@ import torch
 from huggingface_hub import constants, set_client_factory
 
 import lerobot_wm.collect.command
+import lerobot_wm.commands.publish
 import lerobot_wm.encode.command
 import lerobot_wm.evaluate.command
-import lerobot_wm.hub.publish
 import lerobot_wm.train.command  # noqa: F401  (all imported for the forks)
 from lerobot_wm import cli
 

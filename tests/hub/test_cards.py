@@ -8,9 +8,9 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies.factory import get_policy_class
 from markdown_it import MarkdownIt
 
+from lerobot_wm.commands.publish import check_records
 from lerobot_wm.constants import MT6
 from lerobot_wm.envs.tasks import task_description
-from lerobot_wm.hub.publish import check_records
 from lerobot_wm.markdown import code, escaped
 from lerobot_wm.policies.common.card import TrainingData, eval_command, model_card
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig

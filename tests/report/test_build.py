@@ -233,7 +233,7 @@ def test_a_dataset_that_the_model_cannot_read_is_refused(
         world_model_path=str(world_model_path),
         dataset=SourceConfig("test/recorded", str(tmp_path / "stranger")),
     )
-    with pytest.raises(ValueError, match=r"test/recorded.*observation\.image\b.*observation\.images\.front"):
+    with pytest.raises(ValueError, match="test/recorded"):
         report(config)
     assert not (tmp_path / "report").exists()
 

@@ -383,9 +383,9 @@ def test_datasets_that_cannot_be_dreamt_of(
 ) -> None:
     one_camera = record(tmp_path / "one", {FRONT: (48, 80)})
     with pytest.raises(
-        ValueError, match=r"test/dream.*observation\.images\.wrist.*observation\.images\.front"
+        ValueError, match=r"observation\.images\.wrist.*test/dream.*observation\.images\.front"
     ):
         lerobot_wm_command(flags(checkpoints["wm_rssm"], one_camera, tmp_path), "--episode=0")
     other_robot = record(tmp_path / "robot", SIZES, action_dim=5)
-    with pytest.raises(ValueError, match=r"'action'.*\(5,\).*test/dream.*\(3,\)"):
+    with pytest.raises(ValueError, match=r"'action'.* 3\b.*test/dream.* 5\b"):
         lerobot_wm_command(flags(checkpoints["wm_rssm"], other_robot, tmp_path), "--episode=0")
