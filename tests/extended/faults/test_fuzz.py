@@ -20,7 +20,7 @@ from lerobot_wm.data.source import DatasetError, open_dataset
 from lerobot_wm.errors import exit_with_one_line
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
-from tests.faults.breakage import EPISODES, INFO, STATS, TASKS
+from tests.extended.faults.breakage import EPISODES, INFO, STATS, TASKS
 from tests.recording import record, vector
 
 SETTINGS: dict[str, Any] = {

@@ -23,7 +23,7 @@ from lerobot_wm import cli
 from lerobot_wm.commands.init import InitConfig, initialise
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.world_model.config import RSSMConfig
-from tests.faults.breakage import Fault, cut, remove, set_entry, write
+from tests.extended.faults.breakage import Fault, cut, remove, set_entry, write
 from tests.recording import camera, record, vector
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"

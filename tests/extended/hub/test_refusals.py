@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.hub.conftest import Machine
-from tests.hub.server import Hub, Repo
+from tests.extended.hub.conftest import Machine
+from tests.extended.hub.server import Hub, Repo
 
 TRAIN = "train --policy.type=wm_rssm --policy.device=cpu --steps=1 --num_workers=0 --output_dir={folder}/run"
 ENCODE = (

@@ -13,8 +13,8 @@ from lerobot.scripts import lerobot_rollout
 from torch import Tensor
 
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
-from tests.arm import JOINTS, Arm
 from tests.documents import commands, with_flags
+from tests.extended.arm import JOINTS, Arm
 from tests.flags import SMALL_WORLD_MODEL
 from tests.recording import camera, record, train_flags, vector
 

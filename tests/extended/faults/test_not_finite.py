@@ -21,7 +21,7 @@ from lerobot_wm.policies.common.divergence import DivergenceError, check_finite,
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.config import RSSMConfig
-from tests.faults.breakage import DATA, set_value
+from tests.extended.faults.breakage import DATA, set_value
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
 
 CPU = torch.device("cpu")

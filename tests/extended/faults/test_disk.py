@@ -16,8 +16,8 @@ from lerobot_wm.data.source import open_dataset
 from lerobot_wm.errors import disk_problem
 from lerobot_wm.files import sole_writer
 from lerobot_wm.records import read_records
-from tests.faults.conftest import WIDE
-from tests.faults.running import Commands, Inputs, remount, small_disk, wait_until
+from tests.extended.faults.conftest import WIDE
+from tests.extended.faults.running import Commands, Inputs, remount, small_disk, wait_until
 
 NAMES = ("collect", "encode", "train", "eval")
 # The disk takes the beginning of what the command writes.

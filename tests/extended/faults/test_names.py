@@ -21,8 +21,8 @@ from lerobot_wm.policies.common.checkpoint import CheckpointError, open_checkpoi
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.records import record_line
 from lerobot_wm.report.command import ReportConfig, report
-from tests.faults.breakage import INFO, ONE_NUMBER, set_entry
-from tests.faults.conftest import WIDE, write_dataset
+from tests.extended.faults.breakage import INFO, ONE_NUMBER, set_entry
+from tests.extended.faults.conftest import WIDE, write_dataset
 
 SCRIPT = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 HOSTILE = (

@@ -17,8 +17,8 @@ from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.encode.dataset import encode
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.inspect.episodes import CheckpointConfig
-from tests.faults.breakage import set_entry
-from tests.faults.checkpoints import TASKS, WEIGHTS, last_line, load, make_checkpoint, record_demos
+from tests.extended.faults.breakage import set_entry
+from tests.extended.faults.checkpoints import TASKS, WEIGHTS, last_line, load, make_checkpoint, record_demos
 from tests.flags import TRAIN_FLAGS
 from tests.recording import camera, vector
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from tests.faults.killing import WatchedCommands
-from tests.faults.running import Commands, Inputs, make_inputs
+from tests.extended.faults.killing import WatchedCommands
+from tests.extended.faults.running import Commands, Inputs, make_inputs
 from tests.recording import camera, vector
 
 FPS = 10

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.running import Inputs
+from tests.extended.faults.running import Inputs
 
 MEND = "apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri and use MUJOCO_GL=egl"
 # EGL is there, and finds nothing to draw on.

@@ -14,8 +14,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.loader import RamDataset
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
+from tests.extended.noting import noting
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
-from tests.noting import noting
 
 BATCH = 16  # of each of two processes; one process has twice as much
 

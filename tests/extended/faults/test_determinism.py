@@ -24,7 +24,7 @@ from lerobot_wm.evaluate.config import variation_of
 from lerobot_wm.policies.latent.policy import load_encoder
 from lerobot_wm.records import Record, read_records
 from lerobot_wm.system import quiet
-from tests.faults.running import Inputs
+from tests.extended.faults.running import Inputs
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
 
 

@@ -6,8 +6,8 @@ import pytest
 from huggingface_hub import ModelCard
 
 from lerobot_wm.data.latents import dataset_fingerprint
-from tests.hub.conftest import TRAIN, Machine, read
-from tests.hub.server import Hub
+from tests.extended.hub.conftest import TRAIN, Machine, read
+from tests.extended.hub.server import Hub
 
 
 @pytest.fixture

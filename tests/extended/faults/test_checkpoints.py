@@ -13,8 +13,8 @@ from lerobot.utils.constants import TRAINING_STEP
 
 from lerobot_wm.encode.dataset import encode
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from tests.faults.breakage import Fault, cut, remove
-from tests.faults.checkpoints import (
+from tests.extended.faults.breakage import Fault, cut, remove
+from tests.extended.faults.checkpoints import (
     CONFIG,
     CONFIG_FAULTS,
     PROCESSOR_FAULTS,

@@ -7,7 +7,7 @@ from lerobot.utils.io_utils import load_json
 
 from lerobot_wm.data.source import open_dataset
 from lerobot_wm.records import read_records
-from tests.faults.running import Commands, Ended, Inputs
+from tests.extended.faults.running import Commands, Ended, Inputs
 
 TRAINED = "training_state/training_step.json"
 

@@ -19,9 +19,9 @@ from benchmarks.table import number
 from benchmarks.timing import rate
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
-from tests import benchmark_sides
+from tests.extended import benchmark_sides
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SIZES = tuple({"batch": batch, "seconds": 1.0} for batch in (1, 2, 3))
 
 

@@ -13,8 +13,8 @@ from PIL import Image
 from safetensors.torch import load
 
 from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint, weights_fingerprint
-from tests.hub.conftest import Machine, read
-from tests.hub.server import Hub
+from tests.extended.hub.conftest import Machine, read
+from tests.extended.hub.server import Hub
 
 PYTHON_BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 PULL = """

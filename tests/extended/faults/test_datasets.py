@@ -15,8 +15,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.source import DatasetError, SourceConfig, open_dataset
 from tests.documents import ROOT
-from tests.faults.breakage import DATA, FAULTS, STATS, VIDEO, damage, remove
-from tests.faults.conftest import WIDE
+from tests.extended.faults.breakage import DATA, FAULTS, STATS, VIDEO, damage, remove
+from tests.extended.faults.conftest import WIDE
 
 
 def test_a_whole_dataset_passes(whole_dataset: Path) -> None:
@@ -99,7 +99,7 @@ def test_commands_end_in_one_line_and_ask_no_network(
         lines += commands if all_faults else [commands[number % 2]]
     environment = {name: value for name, value in os.environ.items() if name != "HF_HUB_OFFLINE"}
     run = subprocess.run(
-        [sys.executable, "tests/faults/breakage.py"],
+        [sys.executable, "tests/extended/faults/breakage.py"],
         cwd=ROOT,
         env=environment,
         input="\n".join(map(json.dumps, lines)),

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.extended.hub.server import Hub, serve
 from tests.flags import SMALL_WORLD_MODEL
-from tests.hub.server import Hub, serve
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 TRAIN = "--policy.device=cpu --policy.push_to_hub=true --batch_size=2 --steps=2 --log_freq=1 --seed=3 --num_workers=0"
 USERS = {"write-user": "user", "read-user": "user", "write-other": "other"}
 
@@ -32,7 +32,7 @@ class Result:
 
 
 class Machine:
-    """Runs commands in processes of their own, see tests/hub/commands.py."""
+    """Runs commands in processes of their own, see tests/extended/hub/commands.py."""
 
     def __init__(self, url: str, folder: Path) -> None:
         self.folder = folder

@@ -16,8 +16,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wm.collect.command import CollectConfig, collect, plan_shards
 from lerobot_wm.collect.shards import SHARD_RECORD
 from lerobot_wm.data.schema import COLLECTION_RECORD
-from tests.faults.killing import WatchedCommands, digests
-from tests.faults.running import processes_of, wait_until
+from tests.extended.faults.killing import WatchedCommands, digests
+from tests.extended.faults.running import processes_of, wait_until
 
 EPISODES = 2
 # One more than there are workers: the third shard is begun when the first is finished.

@@ -13,7 +13,7 @@ from lerobot_wm.envs.tasks import task_description
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.records import read_records
 from lerobot_wm.report.training import read_curves
-from tests.faults.killing import WatchedCommands, digests
+from tests.extended.faults.killing import WatchedCommands, digests
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
 from tests.recording import camera, record, vector
 
