@@ -47,8 +47,8 @@ def test_the_gpu_is_the_one_that_was_named(monkeypatch: pytest.MonkeyPatch) -> N
         (ACTConfig(device="cpu", use_amp=True), None, "bf16"),
         (ACTConfig(device="cpu"), None, "no"),
         (ACTConfig(device="cpu"), "bf16", "bf16"),
-        (E2EBCConfig(device="cpu", dtype="float32"), "bf16", "no"),
-        (E2EBCConfig(device="cpu", dtype="bfloat16"), None, "bf16"),
+        (E2EBCConfig(device="cpu", dtype="float32", push_to_hub=False), "bf16", "no"),
+        (E2EBCConfig(device="cpu", dtype="bfloat16", push_to_hub=False), None, "bf16"),
     ],
 )
 def test_the_precision_is_the_policys(
