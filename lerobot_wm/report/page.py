@@ -161,7 +161,7 @@ def split_figure(records: list[Record]) -> Figure:
                 axes.plot(rate.percent, row + shift, "o", color=colour, markersize=6, clip_on=False)
         axes.plot([], [], "o-", color=colour, label=split)
     axes.set_yticks(range(len(arms)), [shorten(arm) for arm in arms])
-    # The first arm on top, and whole rows whatever is drawn in them.
+    # The first arm on top; every arm has a whole row.
     axes.set_ylim(len(arms) - 0.5, -0.5)
     axes.set_xlim(0, 100)
     axes.set_xlabel("success, % of rollouts over all tasks")

@@ -115,7 +115,7 @@ def test_without_the_flag_nothing_is_logged(tracked_run: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("mode", "found"), [("online", "API key"), ("ofline", "'ofline'")])
-def test_what_wandb_refuses_is_told_in_our_words(
+def test_an_error_of_wandb_says_how_to_fix_it(
     mode: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As on a machine where nobody has logged in.

@@ -120,7 +120,7 @@ def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, 
         ("img", "data:image/webp"),  # how each task begins
         ("img", "data:image/webp"),
         ("img", "data:image/svg+xml"),  # seen and unseen
-        ("video", "data:video/mp4"),  # the first failure, and where it stands in the grid
+        ("video", "data:video/mp4"),  # the first failure, and in its cell of the grid
         ("button", "data:video/mp4"),
         ("video", "data:video/mp4"),  # a dream of each task, as a video and a strip
         ("img", "data:image/png"),

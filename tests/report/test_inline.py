@@ -25,7 +25,7 @@ def test_a_long_name_leaves_room(make_records: Callable) -> None:
 
 
 def test_a_single_arm_has_a_row_of_its_own(make_records: Callable) -> None:
-    """Rollouts on unseen variations alone: their mark stands beside the arm's name, not on the axis."""
+    """Rollouts on unseen variations alone: their mark is level with the arm's name, not on the axis."""
     records = [record for record in make_records("wm_bc", {"reach-v3": (10, 40)}) if not record["seen"]]
     axes = split_figure(records).axes[0]
     assert axes.get_ylim() == (0.5, -0.5)

@@ -68,7 +68,7 @@ def test_each_point_has_its_task_and_its_time(latents: LatentMap, dataset: LeRob
     assert latents.tasks == ["Reach a goal position", "Push and close a window"]
     assert np.bincount(latents.task).tolist() == [FRAMES_PER_EPISODE + 6] * 2
     assert np.sort(latents.time)[[0, 3, 4, -4, -1]].tolist() == pytest.approx([0, 0, 1 / 51, 1, 1], abs=0.02)
-    # An episode begins in one place, whatever comes later: both episodes of a task start from one variation.
+    # Both episodes of a task start from the same variation, so from the same state.
     for task in (0, 1):
         first = latents.points[(latents.task == task) & (latents.time == 0)]
         spread = np.linalg.norm(first[0] - first[1])

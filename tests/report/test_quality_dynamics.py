@@ -91,7 +91,7 @@ def test_drift_compares_with_a_filter_that_is_restarted(
     step, begin = WINDOW + 10, 11
     assert rows[step]["psnr"] == pytest.approx(by_hand(0, step), abs=1e-3)
     assert rows[step]["restarted_psnr"] == pytest.approx(by_hand(begin, step), abs=1e-3)
-    assert abs(by_hand(0, step) - by_hand(begin, step)) > 0.01, "or nothing is told apart here"
+    assert abs(by_hand(0, step) - by_hand(begin, step)) > 0.01, "or the test compares nothing"
     assert rows[WINDOW - 1]["psnr"] == pytest.approx(rows[WINDOW - 1]["restarted_psnr"], abs=1e-3)
     assert rows[WINDOW - 2]["restarted_psnr"] is None
     assert rows[step]["kl"] == pytest.approx(float(filtered[0].kl[step]))

@@ -113,14 +113,14 @@ def test_too_few_variations_are_refused(frames: Frames) -> None:
         splits(frames, rows)
 
 
-def test_the_task_is_told_from_what_holds_it(frames: Frames) -> None:
+def test_the_task_is_found_where_it_is_represented(frames: Frames) -> None:
     accuracy = {row["representation"]: row["accuracy"] for row in probe_task(frames)}
     assert accuracy[LATENT] > 0.99
     assert accuracy[BLIND] == 0.5
     assert accuracy[UNTRAINED] < 0.65
 
 
-def test_one_task_needs_no_telling(frames: Frames) -> None:
+def test_one_task_needs_no_probe(frames: Frames) -> None:
     rows = frames.tasks == "first"
     first = Frames(
         {name: x[rows] for name, x in frames.features.items()},

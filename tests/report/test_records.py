@@ -76,8 +76,8 @@ def test_empty_files_are_refused(tmp_path: Path) -> None:
         read_records([tmp_path / "records.jsonl"])
 
 
-def test_positions_of_sets_without_seen_ones_are_told_apart(make_records: Callable, tmp_path: Path) -> None:
-    """None of sets 43 and 44 is seen; records of before sets were noted are taken as they are."""
+def test_sets_without_seen_variations_are_not_mixed(make_records: Callable, tmp_path: Path) -> None:
+    """None of sets 43 and 44 is seen; older records without a set are accepted."""
     path = tmp_path / "records.jsonl"
     unseen = [record | {"seen": False} for record in make_records("wm_bc", {"reach-v3": (1, 1)})]
     arms = {set_: [r | {"arm": f"of_{set_}", "variation_set": set_} for r in unseen] for set_ in (43, 44)}

@@ -48,7 +48,7 @@ def test_grid_of_rollouts(make_records: Callable, tmp_path: Path) -> None:
     assert all(cell is None or cell.clip is None for cell in rows["expert"]), "of another arm"
 
 
-def test_seen_variations_come_first_whatever_their_number(make_records: Callable) -> None:
+def test_seen_variations_come_first_even_with_larger_numbers(make_records: Callable) -> None:
     records = [r | {"seen": r["variation"] >= 45} for r in make_records("wm_bc", {"reach-v3": (0, 0)})]
     [grid] = make_grids(records, [])
     assert grid.variations[:6] == [45, 46, 47, 48, 49, 0]

@@ -1,4 +1,4 @@
-"""Cards hold what they are given, whatever it is named."""
+"""Cards show names of any kind correctly."""
 
 import pytest
 from huggingface_hub import ModelCard

@@ -1,4 +1,4 @@
-"""What cannot be pulled or pushed ends in one line that says what was found and how to mend it."""
+"""A failed download or upload ends in one line that says what was found and how to fix it."""
 
 from pathlib import Path
 

@@ -12,7 +12,7 @@ from tests.extended.hub.server import Hub
 
 @pytest.fixture
 def version(hub: Hub, demos_commit: str) -> str:
-    """The commit of the dataset's version; other tests publish it anew."""
+    """The commit of the dataset's version; other tests publish it again."""
     return hub.repos["dataset", "user/demos"].tags["v3.0"]
 
 
@@ -47,7 +47,7 @@ assert dataset_folder(name, whole=True) == snapshot
 folder = shutil.copytree(snapshot, HF_LEROBOT_HOME / name)
 (folder / ".cache/huggingface/download").mkdir(parents=True)
 assert dataset_folder(name) == LeRobotDatasetMetadata(name).root == snapshot
-# Recorded here: whatever the revision.
+# Recorded here: used for any revision.
 shutil.rmtree(folder / ".cache")
 for revision in (None, {commit!r}):
     assert dataset_folder(name, revision=revision) == LeRobotDatasetMetadata(name, revision=revision).root == folder
@@ -96,8 +96,8 @@ file.write_bytes(file.read_bytes()[:-100])
     assert "Traceback" not in result.output
     assert f"/{part}/" in result.lines[-1]
     assert said in result.lines[-1]
-    _, _, mend = result.lines[-1].partition("remove ")
-    assert mend.startswith(str(machine.folder / "home/lerobot/hub/datasets--user--demos"))
+    _, _, fix = result.lines[-1].partition("remove ")
+    assert fix.startswith(str(machine.folder / "home/lerobot/hub/datasets--user--demos"))
     assert not (tmp_path / "x").exists()
 
 
