@@ -67,7 +67,8 @@ def _metaworld_tasks(descriptions: list[str]) -> str | None:
 
 
 PACKAGES = ("lerobot_policy_wm", "lerobot", "torch")
-IMAGINATION = "imagination.webp"  # beside the card, where there is one
+# File beside the card, if there is one.
+IMAGINATION = "imagination.webp"
 
 
 @dataclass(frozen=True)

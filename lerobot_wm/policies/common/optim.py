@@ -1,4 +1,4 @@
-"""Optimizer and schedule presets that LeRobot's own set lacks."""
+"""Optimizer and schedule presets that LeRobot does not have."""
 
 from dataclasses import asdict, dataclass
 from math import cos, pi
@@ -32,7 +32,8 @@ class FusedAdamConfig(OptimizerConfig):
 class ActorCosineConfig(LRSchedulerConfig):
     """Cosine decay to zero on the first parameter group (IQL's actor), constant rates on the others."""
 
-    num_warmup_steps: int | None = None  # LeRobot's base class declares it; this schedule has no warm-up
+    # LeRobot's base class declares it; this schedule has no warm-up.
+    num_warmup_steps: int | None = None
 
     def build(self, optimizer: torch.optim.Optimizer, num_training_steps: int) -> LambdaLR:
         """The schedule over `num_training_steps` updates."""
@@ -50,10 +51,10 @@ class ActorCosineConfig(LRSchedulerConfig):
 @LRSchedulerConfig.register_subclass("final_decay")
 @dataclass
 class FinalDecayConfig(LRSchedulerConfig):
-    """A constant rate that falls linearly to zero over the last part of a training.
+    """A constant rate that falls linearly to zero over the last part of training.
 
     Args:
-        share: The part of the steps over which it falls, above 0 and at most 1.
+        share: Part of the steps over which it falls, above 0 and at most 1.
         num_warmup_steps: LeRobot's base class declares it; this schedule has no warm-up.
     """
 

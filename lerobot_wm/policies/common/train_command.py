@@ -1,4 +1,4 @@
-"""The command that trains a policy as a run did, read from the run's configuration."""
+"""The command that repeats a training run, from the run's configuration."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_wm.data.latents import LatentRecord
 
-# Filled in when a policy is made, from its dataset, its world model or its checkpoint.
+# Filled in when a policy is created, from its dataset, its world model or its checkpoint.
 _FILLED_IN = {
     "policy.input_features",
     "policy.output_features",
@@ -29,7 +29,7 @@ _FILLED_IN = {
     "policy.world_model_fingerprint",
     "policy.iql.trained_betas",
 }
-# The machine's, the Hub's, and what is noted, kept and evaluated on the way: not of what is learned.
+# Settings of the machine and the Hub, of logs, checkpoints and evaluation: they do not change what is learned.
 _NO_MATTER = {
     "policy.device",
     "policy.push_to_hub",
@@ -56,7 +56,8 @@ _NO_MATTER = {
     "save_freq",
     "wandb",
 }
-_OF_THEIR_OWN = {  # written by `train_command` and `_policy_flags`
+# Written by `train_command` and `_policy_flags`.
+_OF_THEIR_OWN = {
     "policy",
     "policy.pretrained_path",
     "policy.pretrained_revision",
@@ -66,17 +67,18 @@ _OF_THEIR_OWN = {  # written by `train_command` and `_policy_flags`
     "scheduler",
 }
 _LEFT_OUT = _FILLED_IN | _NO_MATTER | _OF_THEIR_OWN
-_ALWAYS = ("batch_size", "steps", "seed")  # also at their defaults
+# Shown even at their defaults.
+_ALWAYS = ("batch_size", "steps", "seed")
 
 
 def train_command(cfg: TrainPipelineConfig, latents: LatentRecord | None) -> str:
-    """A `lerobot-wm train` command line with every flag that matters to the result and is not at its default.
+    """A `lerobot-wm train` command with every flag that matters to the result and is not at its default.
 
-    Places on the machine that trained are left out: they help no one and are nobody's business.
+    Paths on the machine that trained are left out: they are private, and useless elsewhere.
 
     Args:
-        cfg: Of the run; it trained a policy.
-        latents: Of its dataset, where that holds latents: the command encodes their source.
+        cfg: The run's configuration; it trained a policy.
+        latents: The record of its dataset, if it was one of latents: the command encodes their source.
     """
     flags = _policy_flags(cfg.policy, cfg.resume)
     dataset = cfg.dataset
@@ -89,15 +91,16 @@ def train_command(cfg: TrainPipelineConfig, latents: LatentRecord | None) -> str
             flags |= {f"{name}.type": setting.type, **_changed(setting, {}, f"{name}.")}
     usual = {name: value for name, value in _defaults(TrainPipelineConfig).items() if name not in _ALWAYS}
     flags |= _changed(cfg, usual)
-    flags["policy.push_to_hub"] = False  # LeRobot pushes by default, and wants to know where
+    # LeRobot pushes by default, and then needs a repository.
+    flags["policy.push_to_hub"] = False
     return " ".join(
         ["lerobot-wm train", *(shlex.quote(f"--{key}={_text(value)}") for key, value in flags.items())]
     )
 
 
 def _policy_flags(policy: PreTrainedConfig, resumed: bool) -> dict[str, object]:
-    """The policy's type or checkpoint, and its own settings that are not at their defaults there."""
-    # A run that is gone on with loads its own checkpoint.
+    """The policy's type or checkpoint, and its own settings that differ from the defaults there."""
+    # A resumed run loads its own checkpoint.
     if policy.pretrained_path is None or resumed:
         flags = {"policy.type": policy.type, **_changed(policy, _defaults(type(policy)), "policy.")}
     else:
@@ -105,14 +108,14 @@ def _policy_flags(policy: PreTrainedConfig, resumed: bool) -> dict[str, object]:
         if policy.pretrained_revision is not None:
             flags["policy.pretrained_revision"] = policy.pretrained_revision
         flags |= _changed(policy, _settings_of_checkpoint(policy), "policy.")
-        flags.pop("policy.world_model_path", None)  # it is in the checkpoint, and no other is taken
+        flags.pop("policy.world_model_path", None)  # the world model is in the checkpoint
     if hasattr(policy, "world_model_path"):
         flags.pop("policy.image_key", None)  # its world model's
     return flags
 
 
 def _settings_of_checkpoint(policy: PreTrainedConfig) -> dict[str, Any]:
-    """The settings of the checkpoint that a policy was trained on from; none where that is no longer here."""
+    """The settings of the checkpoint that training started from; empty if it is no longer here."""
     try:
         return vars(
             PreTrainedConfig.from_pretrained(
@@ -124,7 +127,7 @@ def _settings_of_checkpoint(policy: PreTrainedConfig) -> dict[str, Any]:
 
 
 def _changed(config: Any, usual: dict[str, Any], prefix: str = "") -> dict[str, object]:
-    """Settings that are unlike the usual ones or have no usual value, under dotted names."""
+    """Settings that differ from the usual ones or have no usual value, under dotted names."""
     flags: dict[str, object] = {}
     for item in fields(config):
         key, value = prefix + item.name, getattr(config, item.name)
@@ -140,7 +143,7 @@ def _changed(config: Any, usual: dict[str, Any], prefix: str = "") -> dict[str, 
 
 
 def _defaults(kind: type) -> dict[str, Any]:
-    """Defaults of a configuration's settings; an object of it may have filled in what fits this machine."""
+    """Defaults of a configuration class; an instance would fill in what fits this machine."""
     defaults = {}
     for item in fields(kind):
         if item.default is not MISSING:
@@ -151,7 +154,7 @@ def _defaults(kind: type) -> dict[str, Any]:
 
 
 def _public(path: str | Path, name: str) -> str:
-    """A Hub id, user/name or user/name@revision, as it is; a name in place of a folder."""
+    """A Hub id, user/name or user/name@revision, unchanged; a placeholder instead of a folder."""
     is_hub_id = re.fullmatch(r"[\w-][\w.-]*/[\w.-]+(@.+)?", str(path)) is not None
     return str(path) if is_hub_id and not Path(path).exists() else name
 

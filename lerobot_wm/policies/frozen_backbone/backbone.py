@@ -1,4 +1,4 @@
-"""A frozen image backbone that stands where a world model stands: its latent is the images' pooled features."""
+"""A frozen image backbone in place of a world model: its latent is the pooled features of the images."""
 
 import difflib
 import pickle
@@ -14,14 +14,16 @@ from torchvision.transforms.v2 import functional as vision
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import RGB_CHANNELS
 from lerobot_wm.world_model.interface import LatentModel, PlainState
 
-# Where published files keep the state dict, and what its keys begin with: R3M has {"r3m": {"module.convnet. ..."}}.
+# Keys under which published files store the state dict, and prefixes of its keys: R3M has
+# {"r3m": {"module.convnet. ..."}}.
 CONTAINERS = ("r3m", "state_dict", "model")
 PREFIXES = ("module.convnet.", "convnet.", "module.", "backbone.", "model.")
-CLASSIFIERS = ("fc.", "classifier.", "head.", "heads.")  # of models trained to classify; it is left out
+# Layers of models trained to classify, which are left out.
+CLASSIFIERS = ("fc.", "classifier.", "head.", "heads.")
 
 
 def load_backbone_weights(model: nn.Module, path: str) -> None:
-    """Load a user's weights into a backbone: every one of its parameters, from that file.
+    """Load a user's weights into a backbone; the file must have all of its parameters.
 
     Args:
         model: The backbone without its classifier.
@@ -29,11 +31,11 @@ def load_backbone_weights(model: nn.Module, path: str) -> None:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no state dict, or not this model's; names what is missing or left over.
+        ValueError: It is not a state dict of this model; names what is missing or left over.
     """
     file = Path(path)
     if not file.is_file():
-        raise FileNotFoundError(f"--policy.weights_path={path}: there is no such file.")
+        raise FileNotFoundError(f"--policy.weights_path={path}: no such file.")
     weights = _strip(_read(file))
     own = model.state_dict()
     missing = sorted(own.keys() - weights.keys())
@@ -59,7 +61,7 @@ def _read(file: Path) -> dict[str, Tensor]:
         content = torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise ValueError(
-            f"{file} holds more than tensors, and reading it could run foreign code. Save its state dict alone: "
+            f"{file} holds more than tensors, and reading it could run unknown code. Save its state dict only: "
             "torch.save(model.state_dict(), ...), or as safetensors."
         ) from error
     for name in CONTAINERS:
@@ -69,7 +71,7 @@ def _read(file: Path) -> dict[str, Tensor]:
 
 
 def _strip(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Without the prefix under which a larger model keeps its backbone, and without that model's other parts."""
+    """Remove the prefix under which a larger model stores its backbone, and that model's other parts."""
     for prefix in PREFIXES:
         if any(key.startswith(prefix) for key in weights):
             return {
@@ -91,17 +93,17 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 class FrozenBackbone(LatentModel):
     """A torchvision or timm model without its classifier, on images with ImageNet's normalisation.
 
-    Its latent is the features of a frame, which depend on its own image alone.
+    Its latent is the features of a frame, which depend on that image alone.
 
     Args:
         name: A classification model of torchvision, or `timm/NAME` for one of timm.
         image_size: Height and width that images are resized to.
-        n_cameras: Number of cameras, each encoded by itself.
-        frame_size: (H, W) of the images that it is given; None where that is its own.
+        n_cameras: Number of cameras, each encoded separately.
+        frame_size: (H, W) of the images it is given; None for `image_size`.
 
     Raises:
         ValueError: There is no such model, or it takes no images of this size.
-        ImportError: timm is asked for and not installed.
+        ImportError: timm is needed and not installed.
     """
 
     def __init__(
@@ -116,7 +118,7 @@ class FrozenBackbone(LatentModel):
 
     @property
     def encoding_settings(self) -> dict[str, Any]:
-        """Networks that pool take any size of image, and see something else in each, and in what was smaller before."""
+        """Image sizes: pooling networks take any, and their features depend on it and on earlier resizing."""
         settings: dict[str, Any] = {"image_size": self.image_size}
         if self.frame_size != (self.image_size, self.image_size):
             settings["frame_size"] = list(self.frame_size)
@@ -147,7 +149,7 @@ class FrozenBackbone(LatentModel):
 
     @torch.no_grad()
     def _feature_dim(self) -> int:
-        """F, found by trying: no table of models knows which image sizes they take."""
+        """F, found by a forward pass: no table says which image sizes the models take."""
         size = self.image_size
         try:
             features = self.embed(torch.zeros(1, 1, RGB_CHANNELS * self.n_cameras, size, size))
@@ -176,7 +178,7 @@ def make_model(name: str) -> nn.Module:
             f"{', '.join(close or known)}. timm's are named timm/NAME."
         )
     model = torchvision.models.get_model(name, weights=None)
-    # torchvision's classifiers end in one linear layer, applied to pooled features.
+    # torchvision's classifiers end in a linear layer on pooled features.
     linear = [path for path, module in model.named_modules() if isinstance(module, nn.Linear)]
     if not linear:
         raise ValueError(f"{name} pools class scores, not features: choose another model, such as resnet18.")
