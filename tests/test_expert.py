@@ -94,7 +94,7 @@ def test_earlier_records_are_never_overwritten(
     tmp_path: Path, lerobot_wm_command: Callable[..., None]
 ) -> None:
     (tmp_path / "records.jsonl").write_text("")
-    with pytest.raises(FileExistsError, match="remove it"):
+    with pytest.raises(FileExistsError, match=r"records\.jsonl"):
         lerobot_wm_command(f"expert --output_dir={tmp_path}")
 
 
@@ -104,6 +104,6 @@ def test_records_that_another_has_finished_meanwhile_stay(tmp_path: Path) -> Non
             super().validate()
             self.records_file.write_text("finished")
 
-    with pytest.raises(FileExistsError, match="remove it"):
+    with pytest.raises(FileExistsError, match=r"records\.jsonl"):
         roll_out_expert(Late(tasks="reach-v3", variations="0", output_dir=tmp_path))
     assert (tmp_path / "records.jsonl").read_text() == "finished"

@@ -14,5 +14,5 @@ def test_a_damaged_record_is_refused(content: str, tmp_path: Path) -> None:
     LatentRecord("abc", "user/images", "def", ["Lift"], False).write(tmp_path)
     assert LatentRecord.read(tmp_path).tasks == ["Lift"]
     path.write_text(content)
-    with pytest.raises(ValueError, match=r"latents.json is no record of latents .*cut short or damaged"):
+    with pytest.raises(ValueError, match=r"latents\.json"):
         LatentRecord.read(tmp_path)

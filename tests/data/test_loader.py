@@ -170,9 +170,7 @@ def test_depth_cameras_are_refused(tmp_path: Path) -> None:
         lambda: RamDataset(dataset, CPU),
         lambda: camera_frames(dataset, "observation.images.depth"),
     ):
-        with pytest.raises(
-            ValueError, match=r"depth cameras, observation\.images\.depth; .*--policy\.image_key"
-        ):
+        with pytest.raises(ValueError, match=r"observation\.images\.depth.*--policy\.image_key"):
             read()
 
 

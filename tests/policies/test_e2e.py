@@ -306,6 +306,7 @@ def test_a_policy_left_in_training_mode_acts_without_dropout_and_crops() -> None
 def test_a_policy_of_one_task_is_not_evaluated_on_another() -> None:
     """Elsewhere it does its one task whatever it is told; metaworld_mt's tasks are known before work starts."""
     config = make_config("e2e_bc", (3, 64, 64), tasks=["Reach a goal position"])
+    config.validate_features()
     check_fit(config, MetaworldMTEnvConfig(task="reach-v3"))
     with pytest.raises(ValueError, match=r"Unknown task \['Open a drawer'\]"):
         check_fit(config, MetaworldMTEnvConfig(task="drawer-open-v3"))

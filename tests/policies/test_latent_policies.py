@@ -291,7 +291,7 @@ def test_latents_of_another_world_model(
         f"--dataset.root={latents_root} --output_dir={tmp_path / 'run'}",
         monkeypatch,
     )
-    assert "were encoded by world model" in message
+    assert "of world model" in message
 
 
 def test_images_without_latents(
@@ -423,18 +423,11 @@ def test_a_training_whose_latents_were_removed_says_how_to_make_them_again(
     go_on = f"train --config_path={checkpoint / 'train_config.json'} --resume=true"
     with pytest.raises(FileNotFoundError, match="lerobot-wm encode") as error:
         lerobot_wm_command(go_on)
-    flags = re.search(r"lerobot-wm (encode .*?), with", str(error.value))[1]
+    flags = re.search(r"lerobot-wm (encode .*)", str(error.value))[1]
     flags = flags.replace("repo_id=...", "repo_id=test/demos").replace("root=...", f"root={demos_root}")
     lerobot_wm_command(f"{flags} --device=cpu")
     lerobot_wm_command(go_on)
     assert (run / "checkpoints" / "000002").is_dir()
-
-
-def test_to_go_on_with_a_training_of_the_hub_needs_a_folder(
-    tmp_path: Path, policy_paths: dict[str, Path], lerobot_wm_command: Callable[..., None]
-) -> None:
-    with pytest.raises(ValueError, match=r"someone/wm_bc is no file or folder here.*--output_dir"):
-        lerobot_wm_command("train --config_path=someone/wm_bc --resume=true")
 
 
 @pytest.mark.parametrize("policy_type", POLICY_TYPES)

@@ -129,7 +129,7 @@ def test_broken_checkpoints_are_refused(world_model_path: Path, tmp_path: Path, 
     save_file(tensors, weights)
     if fault == "cut short":
         weights.write_bytes(weights.read_bytes()[:1000])
-    with pytest.raises(ValueError, match="NaN or Inf" if fault == "NaN" else "does not fit"):
+    with pytest.raises(ValueError, match=r"model\.safetensors"):
         WMRSSMPolicy.from_pretrained(broken)
 
 

@@ -100,7 +100,9 @@ class LatentPolicyConfig(PolicyConfig):
                 model's, or `save_predicted_video` is set where nothing predicts.
             FileNotFoundError: The world model's checkpoint is not there.
         """
-        if self.use_latent and self.world_model is None:
+        if not self.use_latent:
+            self.world_model = None
+        elif self.world_model is None:
             self._take_world_model()
         read = {OBS_STATE, *self.cameras, OBS_ENV_STATE if self.use_environment_state else None}
         state = self.input_features.get(OBS_STATE)
