@@ -1,5 +1,9 @@
 """One scripted demonstration: an expert's actions plus noise, recorded as they were executed."""
 
+# First, because it says what to do if MuJoCo finds no OpenGL.
+import lerobot_wm.envs.rendering  # noqa: F401
+
+# isort: split
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,9 @@
 """The physics of a Meta-World task, placed in one of its fixed variations."""
 
+# First, because it says what to do if MuJoCo finds no OpenGL.
+import lerobot_wm.envs.rendering  # noqa: F401
+
+# isort: split
 import pickle
 from typing import Any, NamedTuple
 

@@ -16,7 +16,7 @@ from lerobot_wm.data.source import damaged_tables_named, open_dataset
 from lerobot_wm.encode.dataset import LATENTS_PREFIX, encode_to_cache
 from lerobot_wm.errors import check_can_push
 from lerobot_wm.files import sole_writer
-from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config
+from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config, read_json
 from lerobot_wm.policies.common.checks import check_fit, names_given_by
 from lerobot_wm.policies.common.config import PolicyConfig
 from lerobot_wm.policies.latent.config import LatentPolicyConfig
@@ -142,6 +142,8 @@ def main() -> None:
     config_path = parser.parse_arg("config_path")
     if config_path is not None:
         restore_last(Path(config_path))
+        if Path(config_path).is_file():
+            read_json(Path(config_path))
     path = parser.get_path_arg("policy")
     if path:  # before LeRobot's parser reads it, which would show a traceback
         open_checkpoint(path, parser.parse_arg("policy.pretrained_revision"))

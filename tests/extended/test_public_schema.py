@@ -197,5 +197,5 @@ def test_labels_without_tables_are_no_zeros(dataset: LeRobotDataset, tmp_path: P
     """Of a dataset that is streamed only the metadata is here."""
     shutil.copytree(Path(dataset.root) / "meta", tmp_path / "meta")
     meta = LeRobotDatasetMetadata("test/streamed", root=tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"has no tables, and next\.success is read from them"):
+    with pytest.raises(FileNotFoundError, match=r"has no tables to read next\.success"):
         RewardsAndEnds(make_policy_config("e2e_iql", device="cpu"), meta)

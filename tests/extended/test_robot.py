@@ -140,13 +140,13 @@ def test_cameras_of_other_names_are_renamed(policies: dict[int, Path], rollout: 
 @pytest.mark.parametrize(
     ("image_sizes", "flags", "message"),
     [
-        ({"front": [48, 64]}, [], r"sees 'observation\.images\.wrist'; the observation has .*front\. Add"),
+        ({"front": [48, 64]}, [], r"observation\.images\.wrist; the observation has .*front\. Add"),
         (
             {"front": [48, 48], "wrist": [32, 32]},
             [],
-            r"front' is \(3, 48, 48\).*height of 48 and a width of 64",
+            r"front' is \(3, 48, 48\).*height 48 and width 64",
         ),
-        (CAMERAS, ["--robot.n_joints=2"], r"'observation\.state' has 2 numbers.*trained on 3"),
+        (CAMERAS, ["--robot.n_joints=2"], r"'observation\.state' has 2 numbers.*trained with 3"),
         (CAMERAS, ["--task="], r"no 'task' strings.*Pick up the cup.*Open the lid.*--task"),
         (CAMERAS, ["--task=Juggle"], r"Unknown task \['Juggle'\].*Pick up the cup"),
     ],

@@ -212,7 +212,7 @@ def test_encoded_parts_make_the_whole(
             tmp_path / f"machine_{i}" / "latents.parts", tmp_path / "latents.parts", dirs_exist_ok=True
         )
     command(tmp_path / "latents")
-    assert "2 of 2 batches are in" in capsys.readouterr().out
+    assert "2 of 2 batches are already in" in capsys.readouterr().out
     assert files(tmp_path / "latents") == files(tmp_path / "whole")
     record = LatentRecord.read(tmp_path / "latents")
     assert record == LatentRecord.read(tmp_path / "whole")

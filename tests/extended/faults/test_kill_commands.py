@@ -150,7 +150,7 @@ def test_policy_training(policy: tuple[Training, Path, list[str]], tmp_path: Pat
     train_with_kills(policy, 20, tmp_path / "run")
 
 
-# The second checkpoint: `last` is there already, and between two touches it is not.
+# The second checkpoint: `last` already exists, and between two touches it is not.
 MOMENTS = ["os.mkdir training_state", "os.symlink checkpoints/last"]
 OTHER_MOMENTS = [
     "os.mkdir 000006",
@@ -211,7 +211,7 @@ def test_training_does_not_write_over_checkpoints(
     run = shutil.copytree(world_model[1], tmp_path / "run", symlinks=True)
     before = digests(run)
     config = run / "checkpoints" / "000003" / "pretrained_model" / "train_config.json"
-    with pytest.raises(FileExistsError, match=r"holds later checkpoints, 000006, .* from step 3"):
+    with pytest.raises(FileExistsError, match=r"000006\).* from step 3"):
         lerobot_wm_command(f"train --config_path={config} --resume=true --output_dir={run}")
     assert digests(run) == before
 
@@ -227,7 +227,7 @@ def test_going_on_from_an_earlier_last_removes_no_checkpoints(
     shutil.copytree(run / "checkpoints" / "000006", run / "checkpoints" / "000009")
     before = digests(run)
     config = last / "pretrained_model" / "train_config.json"
-    with pytest.raises(FileExistsError, match=r"holds later checkpoints, 000006, 000009, .* from step 3"):
+    with pytest.raises(FileExistsError, match=r"000006, 000009\).* from step 3"):
         lerobot_wm_command(f"train --config_path={config} --resume=true --output_dir={run}")
     assert digests(run) == before
 
@@ -235,7 +235,7 @@ def test_going_on_from_an_earlier_last_removes_no_checkpoints(
 def test_a_training_without_a_checkpoint_begins_again(
     tmp_path: Path, lerobot_wm_command: Callable[..., None]
 ) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no whole checkpoint beside it: .* begins again"):
+    with pytest.raises(FileNotFoundError, match=r"train_config.json"):
         lerobot_wm_command(f"train --config_path={tmp_path / LAST / 'train_config.json'} --resume=true")
 
 
@@ -268,7 +268,7 @@ def test_encoding_killed_at_its_very_end(
     assert commands.run(command, tmp_path, touches.index("shutil.rmtree latents.parts"))
     assert (tmp_path / "latents.parts").exists()
     assert digests(tmp_path / "latents") == digests(expected)
-    with pytest.raises(FileExistsError, match="is there already"):
+    with pytest.raises(FileExistsError, match="already exists"):
         lerobot_wm_command(command)
     assert [path.name for path in tmp_path.iterdir()] == ["latents"]
 

@@ -118,6 +118,7 @@ def test_training_on_does_not_run_code_of_the_checkpoint(
 ) -> None:
     checkpoint = tmp_path / "checkpoint"
     WMRSSMConfig(device="cpu", push_to_hub=False).save_pretrained(checkpoint)
+    save_file({"x": torch.zeros(1)}, checkpoint / "model.safetensors")
     step = {"class": "pathlib.Path.touch", "config": {"self": str(tmp_path / "ran")}}
     (checkpoint / "policy_preprocessor.json").write_text(json.dumps({"name": "x", "steps": [step]}))
     with pytest.raises(ValueError, match="registry_name"):

@@ -33,7 +33,7 @@ CPU = torch.device("cpu")
 )
 def test_data_is_refused_when_it_is_cached(column: str, value: Any, dataset: Path) -> None:
     set_value(dataset, DATA.format(1), column, row=3, value=value)
-    expected = rf"{column} holds NaN or Inf in episode 1 \(task 'Push'\), frame 3"
+    expected = rf"{column} is NaN or Inf in episode 1 \(task 'Push'\), frame 3"
     with pytest.raises(DatasetError, match=expected):
         RamDataset(LeRobotDataset("test/faults", root=dataset), CPU)
     with pytest.raises(DatasetError, match=expected):
@@ -106,7 +106,7 @@ def test_a_policys_training_on_broken_data_encodes_nothing(
         f"--dataset.repo_id=test/faults --dataset.root={dataset}",
     )
     set_value(dataset, DATA.format(2), "action", row=1, value=[0.0, math.nan])
-    with pytest.raises(DatasetError, match=r"action holds NaN or Inf in episode 2 \(task 'Lift'\), frame 1"):
+    with pytest.raises(DatasetError, match=r"action is NaN or Inf in episode 2 \(task 'Lift'\), frame 1"):
         lerobot_wm_command(
             f"train --policy.type=wm_bc --policy.world_model_path={tmp_path / 'wm' / 'pretrained_model'} --steps=1",
             f"{TRAIN_FLAGS} --dataset.repo_id=test/faults --dataset.root={dataset} --output_dir={tmp_path / 'run'}",

@@ -5,7 +5,6 @@ from huggingface_hub import ModelCard
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.policies.factory import get_policy_class
 from markdown_it import MarkdownIt
 
 from lerobot_wm.commands.publish import check_records
@@ -59,11 +58,7 @@ def test_no_name_breaks_a_card() -> None:
     config.output_features = features("ACTION", "action", (4,))
     run = TrainPipelineConfig(dataset=DatasetConfig(repo_id="user/x"), policy=config)
     data = TrainingData("user/x", 2, 100, 30, NASTY[0], NASTY, "0123456789abcdef", None)
-    policy_class = get_policy_class("wm_rssm")
-    card = model_card(
-        *(policy_class, config, "user/wm", run, data),
-        **{"imagined_tasks": NASTY, "features_read": config.features_read, "makes_latents": True},
-    )
+    card = model_card(config, "user/wm", run, data, imagined_tasks=NASTY)
     again = ModelCard(str(card))
     assert again.data.license == "apache-2.0"
     shown = html(again.text)
@@ -148,10 +143,7 @@ def test_a_backbones_card_names_what_it_reads() -> None:
     config.input_features = features("VISUAL", "observation.image", (3, 64, 64))
     config.input_features |= features("STATE", "observation.state", (4,))
     config.output_features = features("ACTION", "action", (4,))
-    card = model_card(
-        *(get_policy_class("frozen_backbone"), config, "user/resnet", None, None),
-        **{"features_read": config.features_read, "makes_latents": True},
-    )
+    card = model_card(config, "user/resnet", None, None)
     inputs = str(card).split("| input | shape |")[1].split("\n\n")[0]
     assert "observation.image" in inputs
     assert "observation.state" not in inputs

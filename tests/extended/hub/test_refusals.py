@@ -37,7 +37,7 @@ def odd_repositories(hub: Hub) -> None:
         (f"{ENCODE}user/wm --dataset.revision=nope", "write-user", "user/demos has no revision 'nope'"),
         (f"{ENCODE}user/wm --dataset.repo_id=user/half", "write-user", "its upload did not finish"),
         (f"{ENCODE}user/wm@v9", "write-user", "model user/wm has no revision 'v9'"),
-        (f"{ENCODE}outputs/no/such/folder", "write-user", "not a folder on this machine"),
+        (f"{ENCODE}outputs/no/such/folder", "write-user", "neither a folder on this machine nor"),
         (
             "report --records={folder}/records.jsonl --dataset.repo_id=user/demos --dataset.revision=v9",
             "write-user",
@@ -54,9 +54,9 @@ def odd_repositories(hub: Hub) -> None:
         # The token does not do.
         (f"{ENCODE}user/wm", "wrong-token", "Invalid credentials"),
         (f"{ENCODE}user/secret", "", "or it is private"),
-        (f"{TRAIN} --dataset.repo_id=user/demos --policy.repo_id=user/x", "", "there is none: log in"),
+        (f"{TRAIN} --dataset.repo_id=user/demos --policy.repo_id=user/x", "", "there is no token"),
         ("collect --repo_id=else/x --root={folder}/x --push_to_hub=true", "write-user", "belongs to else"),
-        (f"{ENCODE}user/wm --push_to_hub=true", "read-user", "may only read"),
+        (f"{ENCODE}user/wm --push_to_hub=true", "read-user", "is read-only"),
         ("publish --policy.path={folder} --repo_id=user/x", "", "pushing to user/x needs a token"),
         # What is there would be lost.
         (

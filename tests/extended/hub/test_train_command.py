@@ -42,8 +42,8 @@ def test_the_command_trains_the_same_and_tells_no_place(tmp_path: Path) -> None:
     )
     command = train_command(run, None)
     assert command == (
-        "lerobot-wm train --policy.type=wm_bc '--policy.hidden_dims=[64]' --policy.dropout=0.3 "
-        f"--policy.dtype={policy.dtype} --policy.world_model_path=WORLD_MODEL --dataset.repo_id=user/latents "
+        f"lerobot-wm train --policy.type=wm_bc --policy.dtype={policy.dtype} '--policy.hidden_dims=[64]' "
+        "--policy.dropout=0.3 --policy.world_model_path=WORLD_MODEL --dataset.repo_id=user/latents "
         "--dataset.revision=v1 --seed=5 --batch_size=7 --steps=11 --policy.push_to_hub=false"
     )
     source = LatentRecord("abc", "user/images", "def", TASKS, False)
