@@ -27,7 +27,7 @@ SIZES = tuple({"batch": batch, "seconds": 1.0} for batch in (1, 2, 3))
 
 def row(*peers: str, ours: str = "ours", **settings: Any) -> Row:
     def side(name: str) -> Side:
-        return Side(name, f"tests.extended.benchmark_sides:{name}")
+        return Side(name, f"benchmark_sides:{name}")
 
     return Row("row", "a row", "steps/s", side(ours), tuple(map(side, peers)), SIZES, **settings)
 
@@ -35,7 +35,7 @@ def row(*peers: str, ours: str = "ours", **settings: Any) -> Row:
 @pytest.fixture(autouse=True)
 def importable_sides(monkeypatch: pytest.MonkeyPatch) -> None:
     """Other packages bring a `tests` of their own, which the sides' processes would find first."""
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests" / "extended"))
 
 
 def test_sides_are_measured_by_turns(tmp_path: Path) -> None:
