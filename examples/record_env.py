@@ -108,7 +108,7 @@ def record_episode(
         action = script(frame["observation.state"].astype(float), info).astype(np.float32)
         raw, reward, terminated, truncated, info = env.step(action[None])
         ended = bool(terminated[0] or truncated[0])
-        # With the last step the environment starts anew, and its info is of the next episode.
+        # With the last step the environment starts again, and its info is of the next episode.
         result = info["final_info"] if ended else info
         frame |= {
             "action": action,

@@ -9,7 +9,7 @@ import pytest
 
 from tests.extended.faults.running import Inputs
 
-MEND = "apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri and use MUJOCO_GL=egl"
+FIX = "apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri and use MUJOCO_GL=egl"
 # EGL is there, and finds nothing to draw on.
 NO_DRIVER = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json"}
 COMMAND = (sys.executable, "-m", "lerobot_wm.cli")
@@ -30,7 +30,7 @@ def check_refused(words: list[str], backend: str, output: Path, **environment: s
     assert "Traceback" not in run.stderr
     line = run.stderr.splitlines()[-1]
     assert f": No headless OpenGL (MUJOCO_GL={backend})." in line
-    assert MEND in line
+    assert FIX in line
     assert not list(output.glob("*"))
 
 
