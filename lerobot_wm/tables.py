@@ -1,5 +1,6 @@
 """Tables of results: one data structure for the terminal, for Markdown and for the report's page."""
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import batched
@@ -97,7 +98,8 @@ def markdown_table(table: ReportTable) -> str:
     lines = [f"## {table.title}", "", f"| {table.corner} | {' | '.join(table.columns)} |"]
     lines.append("|---|" + "---:|" * len(table.columns))
     lines += [f"| {label} | {' | '.join(map(cell_text, cells))} |" for label, cells in table.rows]
-    return "\n".join(lines) + "\n\n" + "".join(f"{note}\n\n" for note in table.notes)
+    notes = (textwrap.fill(note, 120, break_long_words=False, break_on_hyphens=False) for note in table.notes)
+    return "\n".join(lines) + "\n\n" + "".join(f"{note}\n\n" for note in notes)
 
 
 def cell_text(cell: Cell) -> str:

@@ -54,7 +54,9 @@ def test_markdown(make_records: Callable) -> None:
         "|---|---:|",
         "| wm_bc | 19/50  38 [26, 52] |",
     ]
-    assert lines[6] == table.notes[0]
+    first_note = lines[6 : lines.index("", 6)]
+    assert " ".join(first_note) == table.notes[0]
+    assert max(map(len, first_note)) <= 120
 
 
 def test_what_is_missing_is_a_dash() -> None:
