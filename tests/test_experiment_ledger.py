@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_wm.experiment.ledger import Ledger
+from lerobot_wm.experiment.experiment import Ledger
 from lerobot_wm.experiment.preset import Preset, load_preset
 from lerobot_wm.records import Record, read_records, record_line
 

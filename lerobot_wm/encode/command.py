@@ -16,7 +16,7 @@ from lerobot_wm.encode.dataset import encode, encode_job, latent_record
 from lerobot_wm.errors import check_can_push
 from lerobot_wm.files import sole_writer
 from lerobot_wm.markdown import render
-from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone
+from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbone
 from lerobot_wm.policies.latent.policy import load_encoder
 from lerobot_wm.workers import Job, check_same_settings
 

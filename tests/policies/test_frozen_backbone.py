@@ -19,9 +19,12 @@ from torch import Tensor, nn
 
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.encode.dataset import encode_to_cache
-from lerobot_wm.policies.frozen_backbone.backbone import FrozenBackbone, load_backbone_weights
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import FrozenBackboneConfig
-from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import FrozenBackbonePolicy
+from lerobot_wm.policies.frozen_backbone.modeling_frozen_backbone import (
+    FrozenBackbone,
+    FrozenBackbonePolicy,
+    load_backbone_weights,
+)
 from lerobot_wm.policies.latent.policy import encoder_fingerprint, load_encoder
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 from tests.recording import FRONT, WRIST, camera, record, vector

@@ -1,7 +1,7 @@
 """Implicit Q-learning for policies: settings, agent, and the rewards and ends of tasks in LeRobot's batches."""
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import DONE, REWARD, SUCCESS
 from lerobot_wm.data.tables import frame_numbers
+from lerobot_wm.policies.common.config import PolicyConfig
 from lerobot_wm.policies.common.optim import ActorCosineConfig
 from lerobot_wm.rl.agent import IQLAgent
 
@@ -90,15 +91,41 @@ class IQLConfig:
             )
 
 
-class UsesIQL(Protocol):
-    """The configuration of a policy that is trained by IQL."""
+@dataclass
+class IQLPolicyConfig(PolicyConfig):
+    """A policy that is trained by IQL, with the settings of the paper (section 3.1.2).
 
-    iql: IQLConfig
-    reward_key: str
+    Args:
+        iql: Settings of IQL.
+        reward_key: The dataset's column that is the reward: next.success for a sparse reward of 1 at success, where
+            next.reward is a dense one.
+    """
+
+    iql: IQLConfig = field(default_factory=IQLConfig)
+    reward_key: str = REWARD
 
     @property
-    def type(self) -> str:
-        """The policy's registered type."""
+    def observation_delta_indices(self) -> list[int]:
+        """Observations at t and t+1."""
+        return [0, 1]
+
+    def get_scheduler_preset(self) -> ActorCosineConfig:
+        """Cosine decay on the actors only."""
+        return self.iql.schedule(self.lr_decay_share)
+
+    def check_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Check that the dataset has the reward, and says where a task ends."""
+        end_column(self, dataset_meta)
+
+    def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """A new policy has actors of its own."""
+        super().fill_from_dataset(dataset_meta)
+        self.iql.trained_betas = []
+
+    def validate_features(self) -> None:
+        """Also note β of every actor."""
+        super().validate_features()
+        self.iql.choose_actors()
 
 
 def _numbers(values: list[float]) -> str:
@@ -170,7 +197,7 @@ class RewardsAndEnds(nn.Module):
         ValueError: The dataset has no reward, or no column that says where a task ends.
     """
 
-    def __init__(self, config: UsesIQL, dataset_meta: LeRobotDatasetMetadata | None = None) -> None:
+    def __init__(self, config: IQLPolicyConfig, dataset_meta: LeRobotDatasetMetadata | None = None) -> None:
         super().__init__()
         end = DONE if dataset_meta is None else end_column(config, dataset_meta)
         self.reward = FrameColumn(config.reward_key, dataset_meta)
@@ -195,7 +222,7 @@ class RewardsAndEnds(nn.Module):
         return reward, end.bool(), ~past_the_end
 
 
-def end_column(config: UsesIQL, dataset_meta: LeRobotDatasetMetadata) -> str | None:
+def end_column(config: IQLPolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> str | None:
     """The dataset's column that says where a task ends; None with `done_key` "never".
 
     Raises:

@@ -1,5 +1,5 @@
 """Processors of the end-to-end IQL policy, where LeRobot's factory looks for them."""
 
-from lerobot_wm.policies.common.processors import make_pre_post_processors as make_e2e_iql_pre_post_processors
+from lerobot.processor import make_default_pre_post_processors as make_e2e_iql_pre_post_processors
 
 __all__ = ["make_e2e_iql_pre_post_processors"]
