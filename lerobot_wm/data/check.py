@@ -118,12 +118,20 @@ def check_dataset(meta: LeRobotDatasetMetadata, *, partial: bool) -> None:
     Raises:
         DatasetError: Names the file, what is wrong with it and how to fix it.
     """
-    _check_names(meta)
-    _check_stats(meta)
-    episodes = _read_episodes(meta)
-    _check_tables(meta, episodes, partial)
-    for camera in meta.video_keys:
-        _check_videos(meta, camera, episodes, partial)
+    try:
+        _check_names(meta)
+        _check_stats(meta)
+        episodes = _read_episodes(meta)
+        _check_tables(meta, episodes, partial)
+        for camera in meta.video_keys:
+            _check_videos(meta, camera, episodes, partial)
+    except DatasetError:
+        raise
+    except Exception as error:  # metadata that LeRobot takes without a look, such as a shape that is no list
+        raise DatasetError(
+            f"{meta.root / 'meta'} has entries that LeRobot does not write ({type(error).__name__}: {brief(error)}): "
+            f"compare {INFO_PATH} with that of another dataset, or {FIX}."
+        ) from error
 
 
 def _check_names(meta: LeRobotDatasetMetadata) -> None:
@@ -193,7 +201,7 @@ def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial:
     for path, rows in files.items():
         if partial and not path.exists():
             continue
-        table = read_file(path, lambda path: pq.read_table(path).select(columns).to_pandas().astype(float))
+        table = read_file(path, lambda path: pq.read_table(path, columns=columns).to_pandas().astype(float))
         lengths = rows["length"].astype(int)
         if len(table) != lengths.sum():
             raise DatasetError(

@@ -62,10 +62,11 @@ def test_the_world_model_of_the_page(
         f"--dataset.repo_id=test/latents --dataset.root={tmp_path / 'latents'} --output_dir={tmp_path / 'bc'}",
     )
     gru = get_policy_class("wm_gru").from_pretrained(world_model)
-    card = str(gru.generate_model_card("user/data", "gru", None, None))
-    assert "encoder = WMGRUPolicy.from_pretrained('gru').world_model" in card
+    gru.config.repo_id = "user/gru"
+    card = str(gru.generate_model_card("user/data", "wm_gru", None, None))
+    assert "encoder = WMGRUPolicy.from_pretrained('user/gru').world_model" in card
     assert "select_action" not in card
-    assert "--policy.world_model_path=gru" in card
+    assert "--policy.world_model_path=user/gru" in card
     (world_model / "model.safetensors").unlink()
     policy = get_policy_class("wm_bc").from_pretrained(
         tmp_path / "bc" / "checkpoints" / "last" / "pretrained_model"
