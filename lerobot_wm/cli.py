@@ -30,6 +30,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "lerobot_wm.inspect.dream_command",
         "an episode as a world model imagines it -> video and strip",
     ),
+    "replay": ("lerobot_wm.inspect.replay", "how far a policy is from recorded actions, without a robot"),
     "publish": ("lerobot_wm.commands.publish", "checkpoint -> the Hub, with results and a dream on its card"),
     "doctor": ("lerobot_wm.commands.doctor", "check Python, GL, packages, GPU, disk and Hub login"),
 }

@@ -12,7 +12,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION
+from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.check import DatasetError
 
 TEXT_DTYPES = ("string", "language")
@@ -42,21 +42,23 @@ def column_tensor(dataset: Dataset, key: str, shape: tuple[int, ...]) -> Tensor:
     return tensor if shape == (1,) else tensor.reshape(-1, *shape)
 
 
-def frame_numbers(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
-    """Read a column with one number per frame from a dataset's files.
+def frame_values(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
+    """Read a numeric column from a dataset's files.
 
     Args:
         meta: The dataset's metadata; its tables are on this machine.
         key: The column.
 
     Returns:
-        (N,) float32 by absolute frame index; zero for episodes that were not downloaded.
+        (N, *shape) float32 by absolute frame index, (N,) for a column of shape (1,); zero for episodes that were not
+        downloaded.
 
     Raises:
         FileNotFoundError: No table is on this machine.
     """
-    numbers = torch.zeros(meta.total_frames)
-    paths = sorted((Path(meta.root) / "data").rglob("*.parquet"))
+    shape = tuple(meta.features[key]["shape"])
+    numbers = torch.zeros(meta.total_frames, *(() if shape == (1,) else shape))
+    paths = _tables(meta)
     if not paths:
         raise FileNotFoundError(
             f"{Path(meta.root) / 'data'} has no tables to read {key} from: train without --dataset.streaming=true, or "
@@ -67,8 +69,36 @@ def frame_numbers(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
         index, values = (
             np.concatenate([_flat_values(chunk) for chunk in table[name].chunks]) for name in ("index", key)
         )
-        numbers[torch.from_numpy(index)] = torch.from_numpy(values.astype(np.float32))
+        numbers[torch.from_numpy(index)] = torch.from_numpy(values.astype(np.float32)).view(
+            -1, *numbers.shape[1:]
+        )
     return numbers
+
+
+def _tables(meta: LeRobotDatasetMetadata) -> list[Path]:
+    return sorted((Path(meta.root) / "data").rglob("*.parquet"))
+
+
+# An action's number counts as a target for a measured one where their difference varies this much less.
+_RELATIVE_SPREAD = 0.5
+
+
+def relative_to_state(meta: LeRobotDatasetMetadata, state_key: str = OBS_STATE) -> list[int]:
+    """The numbers of the action that are targets for the same number of the state, such as a joint's position.
+
+    The state must have as many numbers as the action, and the difference of the two at most half the standard deviation
+    of the action: this holds for joint targets, and not for velocities.
+
+    Returns:
+        Their indices; none for a dataset whose tables are not on this machine.
+    """
+    shapes = [tuple(meta.features.get(key, {"shape": ()})["shape"]) for key in (ACTION, state_key)]
+    if shapes[0] != shapes[1] or not _tables(meta):
+        return []
+    action, state = frame_values(meta, ACTION), frame_values(meta, state_key)  # (N, A)
+    spread = action.std(0)
+    chosen = (spread > 0) & ((action - state).std(0) <= _RELATIVE_SPREAD * spread)  # (A,)
+    return chosen.nonzero().flatten().tolist()
 
 
 def _flat_values(array: pa.Array) -> np.ndarray:

@@ -136,9 +136,13 @@ def _act(policy: LatentPolicy, state: RSSMState, last: dict[str, Any], n_steps: 
     world_model = rssm_of(policy)
     tasks = policy.one_hot_tasks(last, 1)  # (1, N)
     env_state = last[OBS_ENV_STATE] if policy.config.use_environment_state else None
+    proprio, reached = last[OBS_STATE], policy.config.relative_indices
     latents = []
     for _ in range(n_steps):
-        action = policy.act(policy.observation(last[OBS_STATE], tasks, state.latent, env_state))  # (1, A)
+        action = policy.act(policy.observation(proprio, tasks, state.latent, env_state), proprio)  # (1, A)
+        # Where the action is a target for the state, the state is imagined to reach it.
+        proprio = proprio.clone()
+        proprio[:, reached] = action[:, reached]
         state = world_model.imagine(state, action[:, None]).last()
         latents.append(state.latent)
     return torch.stack(latents, dim=1)

@@ -219,6 +219,46 @@ class PolicyConfig(PreTrainedConfig):
             )
 
 
+@dataclass
+class ActingConfig(PolicyConfig):
+    """A policy that chooses actions: a head on [features of the images, one-hot task, proprioception].
+
+    Args:
+        hidden_dims: Widths of the hidden layers of every head.
+        dropout: Dropout of the actor.
+        action_noise: Standard deviation of Gaussian noise on the actions at test time, where the dataset's actions span
+            [-1, 1]. It frees a policy that hovers in a place where no demonstration ends.
+        relative_actions: Learn targets relative to the state: the heads learn a_t minus the measured state where the
+            action is a target for it, such as a joint's position. The policy still returns the dataset's units. None
+            finds these numbers in the dataset (see `data.tables.relative_to_state`), true takes all, false none.
+        tasks: Task strings in one-hot order, taken from the dataset when the policy is created.
+        relative_indices: Which numbers of the action these are; filled when the policy is created.
+    """
+
+    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
+    dropout: float = 0.1
+    action_noise: float = 0.0
+    relative_actions: bool | None = None
+    tasks: list[str] = field(default_factory=list)
+    relative_indices: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.action_noise < 0:
+            raise ValueError(
+                f"--policy.action_noise={self.action_noise:g}: a standard deviation is 0 or more."
+            )
+
+    @property
+    def action_dim(self) -> int:
+        """Size of the action."""
+        return feature_dim(self.output_features, ACTION)
+
+    def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Take the tasks."""
+        self.tasks = task_names(dataset_meta)
+
+
 _HINTS = {
     OBS_STATE: "Add it to the robot or environment (--env.obs_type=pixels_agent_pos of LeRobot's environments)",
     OBS_ENV_STATE: (
@@ -265,16 +305,6 @@ def check_tasks(config: Any, names: Iterable[str]) -> None:
             f"Unknown task {sorted(unknown)}; this policy was trained on {config.tasks}. Use one of these strings, or "
             "continue training with --policy.path on a dataset that has the new task."
         )
-
-
-def check_acting(config: Any) -> None:
-    """Check the settings that all acting policies have.
-
-    Raises:
-        ValueError: The action noise is negative.
-    """
-    if config.action_noise < 0:
-        raise ValueError(f"--policy.action_noise={config.action_noise:g}: a standard deviation is 0 or more.")
 
 
 def task_names(dataset_meta: LeRobotDatasetMetadata) -> list[str]:

@@ -9,8 +9,8 @@ from lerobot.utils.constants import OBS_STR
 from torch import Tensor, nn
 
 from lerobot_wm.constants import DONE, REWARD, SUCCESS
-from lerobot_wm.data.tables import frame_numbers
-from lerobot_wm.policies.common.config import PolicyConfig
+from lerobot_wm.data.tables import frame_values
+from lerobot_wm.policies.common.config import ActingConfig
 from lerobot_wm.policies.common.optim import ActorCosineConfig
 from lerobot_wm.rl.agent import IQLAgent
 
@@ -92,7 +92,7 @@ class IQLConfig:
 
 
 @dataclass
-class IQLPolicyConfig(PolicyConfig):
+class IQLPolicyConfig(ActingConfig):
     """A policy that is trained by IQL, with the settings of the paper (section 3.1.2).
 
     Args:
@@ -172,7 +172,7 @@ class FrameColumn(nn.Module):
         self.key = key
         if dataset_meta is not None and key not in IN_BATCHES:
             # (N,) by absolute frame index. It belongs to the dataset, not to checkpoints.
-            self.register_buffer("values", frame_numbers(dataset_meta, key), persistent=False)
+            self.register_buffer("values", frame_values(dataset_meta, key), persistent=False)
 
     def forward(self, batch: dict[str, Any], n_steps: int = 1) -> Tensor:
         """The column at each frame of the batch and at the `n_steps` - 1 frames after it: (B, n_steps).

@@ -17,12 +17,19 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE, TASK
+from lerobot_wm.data.tables import frame_values, relative_to_state
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.policies.common.card import TrainingData, model_card
 from lerobot_wm.policies.common.checkpoint import WHOLE, CheckpointError, cut_short, not_finite, read_config
-from lerobot_wm.policies.common.checks import check_has_stats, check_sizes, current_names, dataset_cameras
-from lerobot_wm.policies.common.config import PolicyConfig, check_tasks, feature_dim, task_names, train_new
+from lerobot_wm.policies.common.checks import (
+    check_has_stats,
+    check_sizes,
+    current_names,
+    dataset_cameras,
+    names_before,
+)
+from lerobot_wm.policies.common.config import ActingConfig, PolicyConfig, check_tasks, task_names, train_new
 from lerobot_wm.policies.common.divergence import check_finite, check_finite_weights
 
 logger = logging.getLogger(__name__)
@@ -221,20 +228,70 @@ class ActingPolicy(BasePolicy):
     Subclasses also define `observation_networks`, `task_start`, `actor_mean` and `select_action`.
     """
 
+    config: ActingConfig
+
     def build(self) -> None:
         """Make the scalings."""
         self.state_scaling = Affine(self.config.state_dim)
-        self.action_scaling = Affine(feature_dim(self.config.output_features, ACTION))
+        self.action_scaling = Affine(self.config.action_dim)
         self._action_noise = ActionNoise(self.config.action_noise)
 
     def fit_dataset(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> None:
-        """Scale proprioception and actions by the dataset's statistics."""
-        self.set_scalings(stats)
-
-    def set_scalings(self, stats: Statistics) -> None:
-        """Scale proprioception to unit variance and actions to [-1, 1] by these statistics."""
+        """Scale proprioception to unit variance and actions to [-1, 1]; choose what is relative to the state."""
         self.state_scaling.set_standard(*statistics(stats, OBS_STATE, "mean", "std"))
-        self.action_scaling.set_range(*statistics(stats, ACTION, "min", "max"))
+        self._choose_relative_actions(dataset_meta)
+        self.action_scaling.set_range(*self._action_range(stats, dataset_meta))
+
+    def _choose_relative_actions(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        config = self.config
+        if config.relative_actions is None:
+            config.relative_indices = relative_to_state(dataset_meta, _state_column())
+        elif not config.relative_actions:
+            config.relative_indices = []
+        elif config.state_dim == config.action_dim:
+            config.relative_indices = list(range(config.action_dim))
+        else:
+            raise ValueError(
+                f"--policy.relative_actions=true: the action has {config.action_dim} numbers and the state "
+                f"{config.state_dim}; expected as many. Leave the flag out."
+            )
+        if config.relative_indices:
+            logger.info(
+                "%d of the action's %d numbers are targets for the state, and are learned relative to it "
+                "(--policy.relative_actions=false learns them as recorded).",
+                len(config.relative_indices),
+                config.action_dim,
+            )
+
+    def _action_range(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> tuple[Tensor, Tensor]:
+        """Lowest and highest actions (A,) of a dataset, as the heads learn them."""
+        low, high = (value.clone() for value in statistics(stats, ACTION, "min", "max"))  # (A,)
+        chosen = self.config.relative_indices
+        if chosen:
+            action, state = (frame_values(dataset_meta, key) for key in (ACTION, _state_column()))  # (N, A)
+            relative = action[:, chosen] - state[:, chosen]  # (N, R)
+            low[chosen], high[chosen] = relative.amin(0), relative.amax(0)
+        return low, high
+
+    def scaled(self, action: Tensor, state: Tensor) -> Tensor:
+        """Actions (B, A) as the heads learn them, given proprioception (B, P) at the same frames."""
+        return self.action_scaling(self._minus_state(action, state, -1))
+
+    def unscaled(self, scaled: Tensor, state: Tensor) -> Tensor:
+        """Undo `scaled`."""
+        return self._minus_state(self.action_scaling.inverse(scaled), state, 1)
+
+    def _minus_state(self, action: Tensor, state: Tensor, sign: int) -> Tensor:
+        chosen = self.config.relative_indices
+        if not chosen:
+            return action
+        index = torch.tensor(chosen, device=action.device)
+        return action.index_add(-1, index, state[..., index].to(action.dtype), alpha=sign)
+
+    def scaled_actions(self, batch: dict[str, Any]) -> Tensor:
+        """A training batch's actions (B, A) as the heads learn them; a state (B, 2, P) is that at t and t+1."""
+        state = batch[OBS_STATE]
+        return self.scaled(batch[ACTION], state[:, 0] if state.ndim > 2 else state)
 
     def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Also learn the dataset's new tasks."""
@@ -244,7 +301,7 @@ class ActingPolicy(BasePolicy):
 
     def warn_if_actions_out_of_range(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Warn of actions in a dataset that this policy, scaled as in its first training, cannot command."""
-        low, high = statistics(dataset_meta.stats or {}, ACTION, "min", "max")  # (A,), on the CPU
+        low, high = self._action_range(dataset_meta.stats or {}, dataset_meta)  # (A,), on the CPU
         ends = (torch.full_like(self.action_scaling.offset, end) for end in (-1.0, 1.0))
         lowest, highest = (self.action_scaling.inverse(end).cpu() for end in ends)  # (A,)
         tolerance = _RANGE_TOLERANCE * (high - low)
@@ -288,16 +345,25 @@ class ActingPolicy(BasePolicy):
         """Forget the episode; LeRobot calls this between episodes."""
         self._action_noise.reset()
 
-    def act(self, observation: Tensor) -> Tensor:
-        """The policy's mean action, clipped to the dataset's range, in its units: (B, A) for observations (B, O)."""
-        return self.action_scaling.inverse(self.actor_mean(observation).clamp(-1, 1))
+    def act(self, observation: Tensor, state: Tensor) -> Tensor:
+        """The policy's mean action, clipped to the dataset's range, in its units.
+
+        Args:
+            observation: What the heads read, (B, O).
+            state: Proprioception in the dataset's units, (B, P).
+
+        Returns:
+            (B, A).
+        """
+        return self.unscaled(self.actor_mean(observation).clamp(-1, 1), state)
 
     def with_noise(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
         """Actions (B, A) with `action_noise`, clipped to the dataset's range; `batch` is that of `select_action`."""
         if self.config.action_noise == 0:
             return action
-        noisy = self._action_noise(self.action_scaling(action), batch)  # (B, A)
-        return self.action_scaling.inverse(noisy.clamp(-1, 1))
+        state = batch[OBS_STATE]
+        noisy = self._action_noise(self.scaled(action, state), batch)  # (B, A)
+        return self.unscaled(noisy.clamp(-1, 1), state)
 
     def one_hot_tasks(self, batch: dict[str, Any], batch_size: int) -> Tensor:
         """One-hot task ids (B, N) from the batch's task strings, or from a single string for all of it.
@@ -325,6 +391,12 @@ class ActingPolicy(BasePolicy):
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """`select_action` as a chunk of one: (B, 1, A)."""
         return self.select_action(batch, **kwargs)[:, None]
+
+
+def _state_column() -> str:
+    """The name that `observation.state` has in the dataset."""
+    [name] = names_before([OBS_STATE], current_names())
+    return name
 
 
 def check_observation(config: PolicyConfig, batch: dict[str, Any]) -> None:

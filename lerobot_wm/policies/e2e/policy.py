@@ -71,4 +71,4 @@ class E2EPolicy(ActingPolicy):
         check_observation(self.config, batch)
         state = batch[OBS_STATE]
         tasks = self.one_hot_tasks(batch, state.shape[0])
-        return self.with_noise(self.act(self.observation(self.images(batch), state, tasks)), batch)
+        return self.with_noise(self.act(self.observation(self.images(batch), state, tasks), state), batch)

@@ -6,7 +6,7 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.iql import RewardsAndEnds, make_agent
 from lerobot_wm.policies.e2e.policy import E2EPolicy
@@ -66,7 +66,7 @@ class E2EIQLPolicy(E2EPolicy):
         now = self.observation(images[:, 0], states[:, 0], tasks)  # (B, O)
         with torch.no_grad():
             following = self.observation(images[:, 1], states[:, 1], tasks)  # (B, O)
-        action = self.action_scaling(batch[ACTION])  # (B, A)
+        action = self.scaled_actions(batch)  # (B, A)
         return self.agent.loss(now, following, action, *self.rewards_and_ends(batch))
 
     def update(self) -> None:

@@ -1,18 +1,17 @@
 """What the configurations of the policies on world-model latents share."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_LATENT, OBS_STATE
+from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
 from lerobot_wm.policies.common.checkpoint import CheckpointError, open_checkpoint
 from lerobot_wm.policies.common.config import (
-    PolicyConfig,
-    check_acting,
+    ActingConfig,
     feature_dim,
     task_names,
     train_new,
@@ -23,15 +22,10 @@ _MIN_LATENT_STD = 1e-5  # below it, scaling latents to unit variance would scale
 
 
 @dataclass
-class LatentPolicyConfig(PolicyConfig):
+class LatentPolicyConfig(ActingConfig):
     """A small multi-task policy on [latent, one-hot task, proprioception] (paper section 3.1.2).
 
     Args:
-        hidden_dims: Widths of the hidden layers of every head.
-        dropout: Dropout of the actor.
-        action_noise: Standard deviation of Gaussian noise on the actions at test time, where the dataset's actions span
-            [-1, 1]. It frees a policy that hovers in a place where no demonstration ends.
-        tasks: Task strings in one-hot order, taken from the dataset when the policy is created.
         world_model_path: Folder or Hub id of the checkpoint of a world model (wm_rssm) or of a frozen_backbone in its
             place; its frozen weights become part of this policy's.
         use_latent: False leaves the latent out: the blind control, which reads proprioception and task id only.
@@ -42,25 +36,12 @@ class LatentPolicyConfig(PolicyConfig):
         world_model, image_key, world_model_fingerprint: Taken from that checkpoint when the policy is created.
     """
 
-    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
-    dropout: float = 0.1
-    action_noise: float = 0.0
-    tasks: list[str] = field(default_factory=list)
     world_model_path: str | None = None
     use_latent: bool = True
     use_environment_state: bool = False
     save_predicted_video: bool = False
     world_model: WorldModelConfig | None = None
     world_model_fingerprint: str | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_acting(self)
-
-    @property
-    def action_dim(self) -> int:
-        """Size of the action."""
-        return feature_dim(self.output_features, ACTION)
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -89,7 +70,7 @@ class LatentPolicyConfig(PolicyConfig):
 
     def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Take the tasks; the world model is read again from its path."""
-        self.tasks = task_names(dataset_meta)
+        super().fill_from_dataset(dataset_meta)
         self.world_model = None
 
     def validate_features(self) -> None:

@@ -167,9 +167,17 @@ class LatentPolicy(ActingPolicy):
         latent = self._filter(batch) if self.config.use_latent else None
         env_state = batch[OBS_ENV_STATE] if self.config.use_environment_state else None
         tasks = self.one_hot_tasks(batch, state.shape[0])
-        action = self.act(self.observation(state, tasks, latent, env_state))
+        action = self.act(self.observation(state, tasks, latent, env_state), state)
         self._prev_action = self.with_noise(action, batch)
         return self._prev_action
+
+    def executed(self, action: Tensor) -> None:
+        """Tell the filter which action was executed last, where it is not the one that `select_action` returned.
+
+        Args:
+            action: a_{t-1}, (B, A) in the dataset's units.
+        """
+        self._prev_action = action.to(self.action_scaling.offset.device)
 
     def decode_predicted_latents(self, frames: Tensor) -> Tensor:
         """The video of a rollout, (T, H, W, C) uint8; LeRobot joins its `last_predicted_latents` to (1, C, T, H, W)."""

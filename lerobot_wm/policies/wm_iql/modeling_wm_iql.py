@@ -5,7 +5,7 @@ from typing import Any
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.config import compiled
 from lerobot_wm.policies.common.iql import RewardsAndEnds, make_agent
@@ -61,9 +61,7 @@ class WMIQLPolicy(LatentPolicy):
         """
         tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
         now, following = (self.observation_at(batch, tasks, t) for t in (0, 1))  # (B, O) each
-        return self.agent.loss(
-            now, following, self.action_scaling(batch[ACTION]), *self.rewards_and_ends(batch)
-        )
+        return self.agent.loss(now, following, self.scaled_actions(batch), *self.rewards_and_ends(batch))
 
     def update(self) -> None:
         """Move the target critics; LeRobot calls this after every optimizer step."""
