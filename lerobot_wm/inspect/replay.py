@@ -77,7 +77,7 @@ class Replayed:
 
     def __init__(self, name: str, path: str, meta: LeRobotDatasetMetadata) -> None:
         self.name = name
-        config = open_checkpoint(path)
+        config = open_checkpoint(path, with_processors=False)
         if isinstance(config, PolicyConfig):
             if not config.chooses_actions:
                 raise ValueError(
@@ -85,6 +85,7 @@ class Replayed:
                     "with `lerobot-wm dream`."
                 )
             check_reads(config, meta)
+        open_checkpoint(path)
         folder, revision = split_revision(path)
         policy_class = get_policy_class(config.type)
         self.policy: PreTrainedPolicy = policy_class.from_pretrained(
