@@ -244,8 +244,8 @@ def run_statistics(records: list[Record]) -> RunStatistics:
 
     Scores are resampled with replacement within each task, so the interval covers the spread between training seeds on
     these variations. It is too narrow for a handful of seeds, and does not know that one multi-task policy's scores
-    depend on each other (tests/report/test_bootstrap.py measures both). Where a task has one seed, its rollouts are
-    resampled: then the interval covers the choice of variations, not the spread between seeds.
+    depend on each other (tests/extended/report/test_bootstrap.py measures both). Where a task has one seed, its
+    rollouts are resampled: then the interval covers the choice of variations, not the spread between seeds.
     """
     rng = np.random.default_rng(RNG_SEED)
     scores, draws, single_run = [], [], False

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from accelerate.state import AcceleratorState
@@ -17,6 +18,7 @@ from lerobot.scripts import lerobot_train
 
 import lerobot_wm  # noqa: F401  (registers the policy and environment types)
 from lerobot_wm import cli
+from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
 
@@ -121,3 +123,23 @@ def policy_paths(
         )
         paths[policy_type] = run_folder / "checkpoints" / "last" / "pretrained_model"
     return paths
+
+
+@pytest.fixture
+def make_env() -> Iterator[Callable[..., MetaworldMTEnv]]:
+    """Makes environments and closes them after the test."""
+    envs: list[MetaworldMTEnv] = []
+
+    def make(task: str, **kwargs: object) -> MetaworldMTEnv:
+        envs.append(MetaworldMTEnv(task, **kwargs))
+        return envs[-1]
+
+    yield make
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture
+def actions() -> np.ndarray:
+    """Ten random actions, float32 (10, 4)."""
+    return np.random.default_rng(0).uniform(-1.0, 1.0, (10, 4)).astype(np.float32)

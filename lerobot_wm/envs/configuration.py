@@ -2,6 +2,7 @@
 
 import logging
 import multiprocessing
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -110,23 +111,22 @@ class MetaworldMTEnvConfig(EnvConfig):
 
         A sub-environment whose episode has ended is neither simulated nor rendered until the next rollout.
         """
-        from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+        from lerobot.envs.utils import freeze_after_episode_end
 
         from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 
+        use_processes = use_async_envs and n_envs > 1
         envs: dict[str, dict[int, Any]] = {}
         for task in resolve_tasks(self.task):
-            env_fns = [partial(MetaworldMTEnv, task, **self.gym_kwargs) for _ in range(n_envs)]
-            if use_async_envs and n_envs > 1:
-                envs[task] = {0: _LazyAsyncVectorEnv(env_fns)}
-            else:
-                envs[task] = {
-                    0: gym.vector.SyncVectorEnv(
-                        [freeze_after_episode_end(env_fn) for env_fn in env_fns],
-                        autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP,
-                    )
-                }
-        if use_async_envs and n_envs > 1:
+            env_fn = freeze_after_episode_end(partial(MetaworldMTEnv, task, **self.gym_kwargs))
+            envs[task] = {
+                0: AsyncEnvs([env_fn] * n_envs)
+                if use_processes
+                else gym.vector.SyncVectorEnv(
+                    [env_fn] * n_envs, autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
+                )
+            }
+        if use_processes:
             self._prepare_workers(n_envs)
         return envs
 
@@ -143,3 +143,24 @@ class MetaworldMTEnvConfig(EnvConfig):
                 n_envs,
                 cores,
             )
+
+
+class AsyncEnvs:
+    """Environments in a process each, started at first use: LeRobot evaluates one task after another."""
+
+    def __init__(self, env_fns: list[Callable[[], gym.Env]]) -> None:
+        self.num_envs = len(env_fns)
+        self._env_fns = env_fns
+        self._envs: gym.vector.AsyncVectorEnv | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        if self._envs is None:
+            self._envs = gym.vector.AsyncVectorEnv(
+                self._env_fns, context="forkserver", autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
+            )
+        return getattr(self._envs, name)
+
+    def close(self) -> None:
+        """Stop the processes, if they were started."""
+        if self._envs is not None:
+            self._envs.close()

@@ -24,7 +24,8 @@ class RSSMConfig:
         hidden_action_share: Share of the training windows in which the filter is not given the previous actions. Above
             0 the filter never gets them at test time. A demonstrator's action reveals the goal as well as the image
             does: a model that always gets it has no reason to look, and a policy on its latents copies its own last
-            action. Imagination always gets the actions; with a share of 1 it learned nothing about them.
+            action. Imagination always gets the actions; with a share of 1 it learned nothing about them. None takes 0;
+            wm_rssm replaces it by 0.5 for data whose last action predicts the next, such as joint targets.
         action_scale: Weight of the action loss. A head predicts a_t from s_t, so that s_t holds what the demonstrator
             reacted to, however small it is in the image. 0 removes the head.
         image_shift: Largest random shift of a training frame before it is encoded, in pixels; the reconstruction target
@@ -48,7 +49,7 @@ class RSSMConfig:
     reward_scale: float = 1.0
     standardize_images: bool = False
     decode_share: float = 1.0
-    hidden_action_share: float = 0.0
+    hidden_action_share: float | None = None
     action_scale: float = 0.0
     image_shift: int = 0
     predict_reward: bool = True
@@ -60,7 +61,7 @@ class RSSMConfig:
     def __post_init__(self) -> None:
         if not 0 < self.decode_share <= 1:
             raise ValueError(f"decode_share is {self.decode_share:g}; expected above 0 and at most 1.")
-        if not 0 <= self.hidden_action_share <= 1:
+        if not 0 <= (self.hidden_action_share or 0) <= 1:
             raise ValueError(f"hidden_action_share is {self.hidden_action_share:g}; expected 0 to 1.")
         if self.min_std <= 0:
             raise ValueError(f"min_std is {self.min_std:g}; expected a standard deviation above 0.")

@@ -48,7 +48,7 @@ class WorldModel(LatentModel):
     @property
     def encoding_settings(self) -> dict[str, Any]:
         """Whether the filter is given the actions."""
-        return {"hidden_actions": True} if self.config.hidden_action_share > 0 else {}
+        return {"hidden_actions": True} if self.config.hidden_action_share else {}
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
         """Compute the image embeddings e_t.
@@ -234,7 +234,7 @@ class WorldModel(LatentModel):
     def _hide(self, prev_actions: Tensor) -> Tensor:
         """Replace scaled actions a_{t-1} (B, T, A) by zeros where the filter is not given them."""
         share = self.config.hidden_action_share
-        if share == 0:
+        if not share:
             return prev_actions
         if not self.training:
             return torch.zeros_like(prev_actions)

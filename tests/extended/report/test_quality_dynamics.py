@@ -12,7 +12,7 @@ from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.quality_episodes import Episode, Filtered, filter_episodes, read_demonstrations
 from lerobot_wm.inspect.quality_measures import drift, kl_quality, reward_quality
 from lerobot_wm.world_model.model import WorldModel
-from tests.report.quality_model import lively_world_model
+from tests.extended.report.quality_model import lively_world_model
 
 WINDOW = 20  # frames of a training window: not the default of 25
 

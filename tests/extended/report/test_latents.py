@@ -19,7 +19,7 @@ from lerobot_wm.inspect.latent_map import (
     task_colours,
 )
 from lerobot_wm.world_model.rssm import RSSMState
-from tests.report.quality_model import lively_world_model
+from tests.extended.report.quality_model import lively_world_model
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.report.world_model import dream_clips
 from lerobot_wm.world_model.config import RSSMConfig
-from tests.report.quality_model import lively_world_model
+from tests.extended.report.quality_model import lively_world_model
 
 Command = Callable[..., None]
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"

@@ -25,7 +25,7 @@ from lerobot_wm.inspect.quality_measures import (
     predictions,
     summarise,
 )
-from tests.report.quality_model import lively_world_model
+from tests.extended.report.quality_model import lively_world_model
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.world_model.config import RSSMConfig
-from tests.report.quality_model import lively_world_model
+from tests.extended.report.quality_model import lively_world_model
 
 CAMERAS = [f"{OBS_IMAGE}s.corner2", f"{OBS_IMAGE}s.topview"]
 POLICIES = {"wm_bc": (WMBCConfig, WMBCPolicy), "wm_iql": (WMIQLConfig, WMIQLPolicy)}
