@@ -1,5 +1,6 @@
 """Configuration of the world model as a LeRobot policy type."""
 
+import logging
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -7,12 +8,18 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
+from lerobot_wm.data.tables import last_action_predicts_next
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.common.config import feature_dim
 from lerobot_wm.policies.common.iql import reward_columns
 from lerobot_wm.policies.common.optim import FusedAdamConfig
 from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.world_model.config import RSSMConfig
+
+logger = logging.getLogger(__name__)
+
+# Of the training windows, where actions are hidden from the filter; in the others it learns what actions do.
+_HIDDEN_SHARE = 0.5
 
 
 @PreTrainedConfig.register_subclass("wm_rssm")
@@ -106,9 +113,17 @@ class WMRSSMConfig(WorldModelConfig):
         self.has_reward(dataset_meta)
 
     def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
-        """Forget the input sizes, and leave out the reward head where there is no reward."""
-        self.rssm.action_dim = self.rssm.image_channels = self.rssm.proprio_dim = 0
-        self.rssm.predict_reward &= self.has_reward(dataset_meta)
+        """Forget the input sizes, leave out a reward head without reward, and choose what the filter is told."""
+        rssm = self.rssm
+        rssm.action_dim = rssm.image_channels = rssm.proprio_dim = 0
+        rssm.predict_reward &= self.has_reward(dataset_meta)
+        if rssm.hidden_action_share is None:
+            rssm.hidden_action_share = _HIDDEN_SHARE if last_action_predicts_next(dataset_meta) else 0.0
+            if rssm.hidden_action_share:
+                logger.info(
+                    "Actions hardly change from one frame to the next: the filter is not told them, so that policies "
+                    "do not copy their own last action (--policy.rssm.hidden_action_share=0 tells it)."
+                )
 
     def validate_features(self) -> None:
         """Choose the cameras and fill the model's input sizes from the features.
