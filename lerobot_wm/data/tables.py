@@ -79,8 +79,8 @@ def _tables(meta: LeRobotDatasetMetadata) -> list[Path]:
     return sorted((Path(meta.root) / "data").rglob("*.parquet"))
 
 
-# Of the standard deviation of actions, the median over their numbers. Joint targets at 10 to 50 Hz change by 0.03 to 0.1
-# from one frame to the next, Meta-World's velocities by 0.5 to 0.7.
+# Change from one frame to the next, of the actions' standard deviation: the median over their numbers. It is 0.03 to 0.1
+# for joint targets at 10 to 50 Hz, and 0.5 to 0.7 for Meta-World's velocities.
 _SMALL_CHANGE = 0.25
 
 
