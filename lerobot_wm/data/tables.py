@@ -79,8 +79,8 @@ def _tables(meta: LeRobotDatasetMetadata) -> list[Path]:
     return sorted((Path(meta.root) / "data").rglob("*.parquet"))
 
 
-# Change from frame to frame over the actions' standard deviation, median over their numbers. It is 0.03 to 0.1 for joint
-# targets at 10 to 50 Hz, and 0.5 to 0.7 for Meta-World's velocities.
+# Change from frame to frame over the actions' standard deviation, median over their numbers. It is 0.03 to 0.1 for
+# joint targets at 10 to 50 Hz, and 0.5 to 0.7 for Meta-World's velocities.
 _SMALL_CHANGE = 0.25
 
 
