@@ -1,7 +1,6 @@
 """Camera frames, decoded once at a model's image size into a memory-mapped uint8 file beside the dataset."""
 
 import logging
-import math
 import os
 import shutil
 from collections.abc import Iterable, Iterator
@@ -9,10 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from numpy.lib.format import open_memmap
 from torch import Tensor
@@ -30,11 +29,8 @@ logger = logging.getLogger(__name__)
 _VIDEO_CHANNELS = 3
 CACHE_VARIABLE = "LEROBOT_WM_CACHE"
 
-# Size of the frames that a thread decodes at once, which bounds memory for long episodes of large images.
-_CHUNK_BYTES = 2**25
-# Frames that are resized at once; in float32 they take four times the memory.
-_RESIZED_AT_ONCE = 8
-# Each thread holds its chunk two or three times.
+# PNG images that a thread reads at once.
+_READ_AT_ONCE = 16
 _MAX_THREADS = 16
 
 
@@ -135,12 +131,12 @@ class CameraCache:
         position = row["dataset_from_index"]
         self._reserve(position, row["length"])
         try:
-            for images in self._images(row):
-                for chunk in images.split(_RESIZED_AT_ONCE):
-                    if chunk.shape[-2:] != size:
-                        chunk = (resize_images(chunk.float() / 255, size) * 255).round().to(torch.uint8)
-                    self._frames[position : position + len(chunk)] = chunk.permute(0, 2, 3, 1).numpy()
-                    position += len(chunk)
+            # One by one, as a frame fits into the processor's cache.
+            for image in self._images(row):
+                if image.shape[-2:] != size:
+                    image = (resize_images(image.contiguous()[None] / 255, size)[0] * 255).round().to(torch.uint8)
+                self._frames[position] = image.permute(1, 2, 0).numpy()
+                position += 1
         except Exception as error:  # decoders do not document what they raise for damaged files
             raise DatasetError(
                 f"{self._file(episode)}: the images of {self._key} in episode {episode} cannot be decoded "
@@ -169,29 +165,21 @@ class CameraCache:
         return root / meta.get_data_file_path(episode)
 
     def _images(self, row: dict[str, Any]) -> Iterator[Tensor]:
-        """An episode's stored frames in chunks, (T, C, H, W) uint8."""
+        """An episode's stored frames, each (C, H, W) uint8."""
         meta = self._dataset.meta
         start, stop = row["dataset_from_index"], row["dataset_to_index"]
-        count = max(1, _CHUNK_BYTES // math.prod(frame_shape(meta.features[self._key])))
         if self._key in meta.video_keys:
             first = row[f"videos/{self._key}/from_timestamp"]
-            for position in range(0, stop - start, count):
-                # Not with torchcodec: LeRobot keeps one decoder per file, and several threads read the same file.
-                yield decode_video_frames(
-                    self._file(row["episode_index"]),
-                    [first + i / meta.fps for i in range(position, min(position + count, stop - start))],
-                    tolerance_s=1 / (4 * meta.fps),
-                    backend="pyav",
-                    return_uint8=True,
-                )
+            times = [first + i / meta.fps for i in range(stop - start)]
+            yield from _video_frames(self._file(row["episode_index"]), times, tolerance=1 / (4 * meta.fps))
             return
         relative = self._dataset.absolute_to_relative_idx
         # Images of other columns are not decoded.
         column = self._dataset.hf_dataset.select_columns(self._key)
-        for position in range(start, stop, count):
+        for position in range(start, stop, _READ_AT_ONCE):
             first = position if relative is None else relative[position]
-            rows = column[first : first + min(count, stop - position)][self._key]
-            yield (torch.stack(rows) * 255).round().to(torch.uint8)
+            for image in column[first : first + min(_READ_AT_ONCE, stop - position)][self._key]:
+                yield (image * 255).round().to(torch.uint8)
 
     @staticmethod
     def _open(path: Path, shape: tuple[int, ...]) -> np.memmap:
@@ -202,6 +190,32 @@ class CameraCache:
                     with appears_whole(path) as temporary:
                         open_memmap(temporary, mode="w+", dtype=np.uint8, shape=shape).flush()
         return open_memmap(path, mode="r+")
+
+
+def _video_frames(path: Path, times: list[float], tolerance: float) -> Iterator[Tensor]:
+    """The frames of a video at these times, each (C, H, W) uint8.
+
+    Args:
+        path: The video.
+        times: In seconds, ascending; further apart than twice the tolerance.
+        tolerance: How far a frame's own time may be from the one asked for, in seconds.
+
+    Raises:
+        ValueError: The video has no frame at one of these times.
+    """
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        # Episodes are decoded side by side: threads of the decoder would wait for each other.
+        stream.codec_context.thread_count = 1
+        container.seek(round(times[0] / stream.time_base) - 1, stream=stream)
+        found = 0
+        for frame in container.decode(stream):
+            if frame.pts is not None and abs(float(frame.pts * stream.time_base) - times[found]) < tolerance:
+                yield torch.from_numpy(frame.to_ndarray(format="rgb24")).permute(2, 0, 1)
+                found += 1
+                if found == len(times):
+                    return
+    raise ValueError(f"it has no frame at {times[found]:.3f} s")
 
 
 def check_colours(dataset: LeRobotDataset, keys: Iterable[str]) -> None:
