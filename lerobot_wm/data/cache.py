@@ -21,7 +21,7 @@ from lerobot_wm.data.check import FIX, DatasetError, brief
 from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.data.source import is_snapshot
 from lerobot_wm.files import appears_whole, sole_writer
-from lerobot_wm.nn.images import resize_images
+from lerobot_wm.nn.images import channels_first, resize_images
 from lerobot_wm.system import usable_cores
 
 logger = logging.getLogger(__name__)
@@ -134,7 +134,9 @@ class CameraCache:
             # One by one, as a frame fits into the processor's cache.
             for image in self._images(row):
                 if image.shape[-2:] != size:
-                    image = (resize_images(image.contiguous()[None] / 255, size)[0] * 255).round().to(torch.uint8)
+                    image = (
+                        (resize_images(image.contiguous()[None] / 255, size)[0] * 255).round().to(torch.uint8)
+                    )
                 self._frames[position] = image.permute(1, 2, 0).numpy()
                 position += 1
         except Exception as error:  # decoders do not document what they raise for damaged files
@@ -207,10 +209,12 @@ def _video_frames(path: Path, times: list[float], tolerance: float) -> Iterator[
         stream = container.streams.video[0]
         # Episodes are decoded side by side: threads of the decoder would wait for each other.
         stream.codec_context.thread_count = 1
-        container.seek(round(times[0] / stream.time_base) - 1, stream=stream)
+        assert stream.time_base is not None  # videos have one
+        seconds = float(stream.time_base)
+        container.seek(round(times[0] / seconds) - 1, stream=stream)
         found = 0
         for frame in container.decode(stream):
-            if frame.pts is not None and abs(float(frame.pts * stream.time_base) - times[found]) < tolerance:
+            if frame.pts is not None and abs(frame.pts * seconds - times[found]) < tolerance:
                 yield torch.from_numpy(frame.to_ndarray(format="rgb24")).permute(2, 0, 1)
                 found += 1
                 if found == len(times):
@@ -242,13 +246,13 @@ def check_colours(dataset: LeRobotDataset, keys: Iterable[str]) -> None:
 
 
 def frame_shape(feature: dict[str, Any]) -> tuple[int, int, int]:
-    """(H, W, C) of a camera's frames.
+    """(H, W, C) of a camera's frames, whatever names its axes have.
 
     Args:
         feature: The camera's entry in a dataset's `features`.
     """
-    shape = tuple(feature["shape"])
-    return shape if feature["names"][2].startswith("channel") else (*shape[1:], shape[0])
+    channels, height, width = channels_first(feature["shape"])
+    return height, width, channels
 
 
 def camera_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int] | None = None) -> Tensor:

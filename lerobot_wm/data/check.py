@@ -5,7 +5,7 @@ and the headers of videos are read here; no image is decoded.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import av
@@ -15,11 +15,10 @@ import pyarrow.parquet as pq
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import load_episodes, load_info, load_stats, load_tasks
 from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR, INFO_PATH, STATS_PATH
-
-from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import DEFAULT_FEATURES
 
 FIX = "copy or download the dataset again"
-_RECOMPUTE = (
+RECOMPUTE = (
     f"{FIX}, or train on a copy that `lerobot-edit-dataset --operation.type=recompute_stats` makes, with "
     "--dataset.use_imagenet_stats=false if it has no statistics of images"
 )
@@ -60,7 +59,15 @@ def brief(error: object) -> str:
     return " ".join(text.split())[:160]
 
 
-def check_metadata_files(folder: Path) -> None:
+def how_to_repair(repo_id: str, root: Path) -> str:
+    """Advice for the end of a message: the command that writes a repaired copy."""
+    return (
+        f"train on the repaired copy that `lerobot-wm repair --dataset.repo_id={repo_id} --dataset.root={root} "
+        f"--output_root=data/{repo_id.split('/')[-1]}_repaired` writes"
+    )
+
+
+def check_metadata_files(folder: Path, repo_id: str) -> None:
     """Check that the metadata is there, and of a version that LeRobot reads.
 
     Raises:
@@ -70,13 +77,12 @@ def check_metadata_files(folder: Path) -> None:
     info = read_file(path, lambda path: json.loads(path.read_text(encoding="utf-8")))
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not str(version).startswith("v3."):
-        raise DatasetError(
-            f"{path}: codebase_version is {str(version)[:80]!r}; expected v3.0. Convert the dataset with "
-            "`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=...`."
-        )
+        is_convertible = version in ("v2.0", "v2.1")
+        fix = how_to_repair(repo_id, folder) if is_convertible else "record it with LeRobot 0.4 or later"
+        raise DatasetError(f"{path}: codebase_version is {str(version)[:80]!r}; expected v3.0: {fix}.")
     if not (folder / STATS_PATH).is_file():
         raise DatasetError(
-            f"{folder / STATS_PATH} is missing, which scales actions and proprioception: {_RECOMPUTE}."
+            f"{folder / STATS_PATH} is missing, which scales actions and proprioception: {RECOMPUTE}."
         )
     for name in _METADATA:
         read_file(folder / name, lambda path: None)
@@ -108,20 +114,24 @@ def name_damaged_table(folder: Path) -> None:
         read_file(path, lambda path: sum(len(rows) for rows in pq.ParquetFile(path).iter_batches()))
 
 
-def check_dataset(meta: LeRobotDatasetMetadata, *, partial: bool) -> None:
+def check_dataset(
+    meta: LeRobotDatasetMetadata, *, partial: bool, chosen: Collection[int] | None = None
+) -> None:
     """Check that a dataset's files are whole and belong together.
 
     Args:
         meta: Its metadata.
         partial: Whether files may be missing, because LeRobot downloads them when they are needed.
+        chosen: The episodes that will be read; None for all. Files of other episodes may be missing.
 
     Raises:
         DatasetError: Names the file, what is wrong with it and how to fix it.
     """
     try:
         _check_names(meta)
-        _check_stats(meta)
+        _check_numbering(meta, meta.features, meta.root / INFO_PATH)
         episodes = _read_episodes(meta)
+        episodes["is_read"] = True if chosen is None else episodes["episode_index"].isin(chosen)
         _check_tables(meta, episodes, partial)
         for camera in meta.video_keys:
             _check_videos(meta, camera, episodes, partial)
@@ -143,22 +153,6 @@ def _check_names(meta: LeRobotDatasetMetadata) -> None:
     # Task strings are looked up by their row.
     if numbers != list(range(len(numbers))):
         raise DatasetError(f"{path}: task_index is {str(numbers)[:80]}; expected 0, 1, 2 and so on: {FIX}.")
-
-
-def _check_stats(meta: LeRobotDatasetMetadata) -> None:
-    """Without statistics LeRobot would train, but not scale actions and proprioception."""
-    for feature in (name for name in (ACTION, OBS_STATE) if name in meta.features):
-        size = int(np.prod(meta.features[feature]["shape"]))
-        for name in ("min", "max", "mean", "std"):
-            try:
-                values = np.asarray(meta.stats[feature][name], dtype=np.float64)
-            except (LookupError, TypeError, ValueError):  # missing, or no numbers
-                values = np.empty(0)
-            if values.size != size or not np.isfinite(values).all():
-                raise DatasetError(
-                    f"{meta.root / STATS_PATH}: {name} of {feature} is {brief(values.tolist())}; expected {size} "
-                    f"finite numbers, which scale it: {_RECOMPUTE}."
-                )
 
 
 def _read_episodes(meta: LeRobotDatasetMetadata) -> pd.DataFrame:
@@ -187,20 +181,32 @@ def _read_episodes(meta: LeRobotDatasetMetadata) -> pd.DataFrame:
     return episodes
 
 
-def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial: bool) -> None:
-    files = {
-        meta.root / meta.get_data_file_path(int(rows["episode_index"].iloc[0])): rows
-        for _, rows in episodes.groupby(["data/chunk_index", "data/file_index"])
+def _files_read(
+    rows: pd.DataFrame, prefix: str, path_of: Callable[[int], Path], partial: bool
+) -> dict[Path, pd.DataFrame]:
+    """The files that will be read, with the episodes in each."""
+    groups = [group for _, group in rows.groupby([f"{prefix}/chunk_index", f"{prefix}/file_index"])]
+    files = {path_of(int(group["episode_index"].iloc[0])): group for group in groups}
+    return {
+        path: group
+        for path, group in files.items()
+        if group["is_read"].any() and (path.exists() or not partial)
     }
-    unknown = sorted(set((meta.root / "data").glob("*/*.parquet")) - files.keys())
+
+
+def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial: bool) -> None:
+    paths = {meta.root / meta.get_data_file_path(episode) for episode in range(len(episodes))}
+    unknown = sorted(set((meta.root / "data").glob("*/*.parquet")) - paths)
     if unknown:
         raise DatasetError(
             f"{unknown[0]} belongs to no episode, but LeRobot would read it: remove the file, or {FIX}."
         )
     columns = ["index", "episode_index", "timestamp"]
+    files = _files_read(
+        episodes, "data", lambda episode: meta.root / meta.get_data_file_path(episode), partial
+    )
     for path, rows in files.items():
-        if partial and not path.exists():
-            continue
+        _check_numbering(meta, read_file(path, lambda path: pq.read_schema(path).names), path)
         table = read_file(path, lambda path: pq.read_table(path, columns=columns).to_pandas().astype(float))
         lengths = rows["length"].astype(int)
         if len(table) != lengths.sum():
@@ -215,18 +221,29 @@ def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial:
                 f"{path}: frames are repeated, missing or out of order, or belong to other episodes: {FIX}."
             )
         if not (abs(table["timestamp"] * meta.fps - frame) < 0.5).all():
+            step = float(table["timestamp"].diff()[frame > 0].median())
             raise DatasetError(
-                f"{path}: the timestamps are not those of {meta.fps:g} frames per second, which is fps in {INFO_PATH}: "
-                f"set fps to the rate of the recording, or {FIX}."
+                f"{path}: the timestamps are not those of {meta.fps:g} frames per second, which is fps in {INFO_PATH}; "
+                f"the median step is {step:.4f} s, {1 / step if step > 0 else 0:.1f} per second. If fps is wrong, "
+                f"correct it there. If frames are {meta.fps:g} per second, {how_to_repair(meta.repo_id, meta.root)}."
             )
+
+
+def _check_numbering(meta: LeRobotDatasetMetadata, names: Collection[str], path: Path) -> None:
+    if missing := [name for name in DEFAULT_FEATURES if name not in names]:
+        raise DatasetError(
+            f"{path} lacks {', '.join(missing)}, by which LeRobot finds frames: "
+            f"{how_to_repair(meta.repo_id, meta.root)}."
+        )
 
 
 def _check_videos(meta: LeRobotDatasetMetadata, camera: str, episodes: pd.DataFrame, partial: bool) -> None:
     prefix = f"videos/{camera}"
-    for _, rows in episodes.groupby([f"{prefix}/chunk_index", f"{prefix}/file_index"]):
-        path = meta.root / meta.get_video_file_path(int(rows["episode_index"].iloc[0]), camera)
-        if partial and not path.exists():
-            continue
+
+    def path_of(episode: int) -> Path:
+        return meta.root / meta.get_video_file_path(episode, camera)
+
+    for path, rows in _files_read(episodes, prefix, path_of, partial).items():
         if missing := read_file(path, _missing_bytes):
             raise DatasetError(f"{path} lacks its last {missing} bytes: it is incomplete; {FIX}.")
         frames = read_file(path, _video_frames)

@@ -101,7 +101,7 @@ class RamDataset:
             for key, kind in kinds.items()
             if kind == "string"
         }
-        check_finite_columns(self._columns, self._tasks, dataset.repo_id)
+        check_finite_columns(self._columns, meta)
         # On the CPU: a GPU's would be waited for at each batch.
         self._task_of_row: list[int] = self._columns["task_index"].tolist()
         # PNG frames leave LeRobot's loader as float32, video frames as uint8 for the training loop to convert.

@@ -1,6 +1,6 @@
 """The gate for datasets: where a LeRobotDataset is on this machine, and opening it once it is checked."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +19,11 @@ from lerobot_wm.data.check import (
     DatasetError,
     check_dataset,
     check_metadata_files,
+    how_to_repair,
     name_damaged_metadata,
     name_damaged_table,
 )
-from lerobot_wm.data.tables import check_finite_dataset
+from lerobot_wm.data.tables import check_finite_dataset, check_stats
 from lerobot_wm.errors import HubRefusalError
 
 
@@ -34,9 +35,9 @@ class SourceConfig:
     root: str | None = None
     revision: str | None = None
 
-    def metadata(self) -> LeRobotDatasetMetadata:
-        """The dataset's metadata; raises what `open_dataset` does."""
-        return open_dataset(self.repo_id, self.root, self.revision)
+    def metadata(self, episodes: Collection[int] | None = None) -> LeRobotDatasetMetadata:
+        """The dataset's metadata, of which some episodes will be read; raises what `open_dataset` does."""
+        return open_dataset(self.repo_id, self.root, self.revision, episodes)
 
     def open(self) -> LeRobotDataset:
         """The dataset with all of its episodes; downloaded if it is not on this machine.
@@ -53,7 +54,10 @@ class SourceConfig:
 
 
 def open_dataset(
-    repo_id: str, root: str | Path | None = None, revision: str | None = None
+    repo_id: str,
+    root: str | Path | None = None,
+    revision: str | None = None,
+    episodes: Collection[int] | None = None,
 ) -> LeRobotDatasetMetadata:
     """Check a dataset and return its metadata; metadata that is not on this machine is downloaded.
 
@@ -63,6 +67,7 @@ def open_dataset(
         repo_id: The dataset's name.
         root: As in `LeRobotDataset`.
         revision: As in `LeRobotDataset`.
+        episodes: The episodes that will be read; None for all.
 
     Raises:
         DatasetError: Files are missing or damaged, do not belong together, or have another version than 3.
@@ -74,7 +79,7 @@ def open_dataset(
     folder = dataset_folder(repo_id, root, revision)
     with _cache_named(folder):
         if folder is not None:
-            check_metadata_files(folder)
+            check_metadata_files(folder, repo_id)
         # LeRobot asks the Hub for the version of a snapshot too.
         if folder is None or (root is None and is_snapshot(folder)):
             _check_version_on_hub(repo_id, revision)
@@ -85,7 +90,8 @@ def open_dataset(
                 name_damaged_metadata(folder)
             raise
         is_download = is_snapshot(meta.root) or (meta.root / ".cache" / "huggingface").is_dir()
-        check_dataset(meta, partial=is_download)
+        check_dataset(meta, partial=is_download, chosen=episodes)
+        check_stats(meta)
     return meta
 
 
@@ -128,6 +134,13 @@ def _check_version_on_hub(repo_id: str, revision: str | None) -> None:
         raise HubRefusalError(
             f"dataset {repo_id} has no version tag such as {CODEBASE_VERSION}: its upload did not finish, or it is not "
             "a LeRobot dataset. Push it again, or give --dataset.revision=main to read what is there."
+        )
+    if versions[-1] < Version("3"):
+        name, version = repo_id.split("/")[-1], f"v{versions[-1]}"
+        raise HubRefusalError(
+            f"dataset {repo_id} is of version {version}; expected {CODEBASE_VERSION}. Download it with "
+            f"`hf download {repo_id} --repo-type=dataset --revision={version} --local-dir=data/{name}`; then "
+            f"{how_to_repair(repo_id, Path('data') / name)}."
         )
     if revision is not None and Version(revision) not in versions:
         raise HubRefusalError(

@@ -1,6 +1,7 @@
 """The numeric columns of a LeRobotDataset as tensors, read from Arrow in one pass."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,11 @@ import torch
 from datasets import Dataset
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import STATS_PATH
 from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
-from lerobot_wm.data.check import DatasetError
+from lerobot_wm.data.check import RECOMPUTE, DatasetError, brief
 
 TEXT_DTYPES = ("string", "language")
 
@@ -147,19 +149,18 @@ def check_finite_dataset(dataset: LeRobotDataset) -> None:
         key: column_tensor(dataset.hf_dataset, key, tuple(features[key]["shape"]))
         for key in (*wanted, "task_index", "episode_index", "frame_index")
     }
-    check_finite_columns(columns, [str(task) for task in dataset.meta.tasks.index], dataset.repo_id)
+    check_finite_columns(columns, dataset.meta)
 
 
-def check_finite_columns(columns: Mapping[str, Tensor], tasks: Sequence[str], repo_id: str) -> None:
+def check_finite_columns(columns: Mapping[str, Tensor], meta: LeRobotDatasetMetadata) -> None:
     """Check that observations, actions and rewards are finite.
 
     Args:
         columns: Tensors (N, ...), including `task_index`, `episode_index` and `frame_index` (N,).
-        tasks: Task strings, by task_index.
-        repo_id: The dataset's name, for the message.
+        meta: The dataset's metadata.
 
     Raises:
-        DatasetError: Names the column, task, episode and frame.
+        DatasetError: Names the column, task, episode and frame, and the command that removes what is not finite.
     """
     for key, values in columns.items():
         if not key.startswith(_LEARNED) or not values.is_floating_point():
@@ -171,7 +172,37 @@ def check_finite_columns(columns: Mapping[str, Tensor], tasks: Sequence[str], re
         task, episode, frame = (
             int(columns[name][row]) for name in ("task_index", "episode_index", "frame_index")
         )
+        damaged = columns["episode_index"][~is_finite].int().unique().tolist()
+        removal = f"--operation.type=delete_episodes --operation.episode_indices='{damaged}'"
+        if len(damaged) == meta.total_episodes:
+            removal = f"--operation.type=remove_feature --operation.feature_names=\"['{key}']\""
+        name = meta.repo_id.split("/")[-1]
         raise DatasetError(
-            f"{repo_id}: {key} is NaN or Inf in episode {episode} (task {tasks[task]!r}), frame {frame}. Use "
-            "lerobot-edit-dataset to remove the episode, or the feature if no policy needs it."
+            f"{meta.repo_id}: {key} is NaN or Inf in episode {episode} (task {str(meta.tasks.index[task])!r}), frame "
+            f"{frame}. Train on a copy without it: `lerobot-edit-dataset --repo_id={meta.repo_id} --root={meta.root} "
+            f"--new_repo_id={meta.repo_id}_finite --new_root=data/{name}_finite {removal}`."
         )
+
+
+def check_stats(meta: LeRobotDatasetMetadata) -> None:
+    """Check the statistics that scale actions and proprioception: LeRobot would train without them, on NaN too.
+
+    Raises:
+        DatasetError: They are missing or not finite; names the frame if a column is not finite itself.
+    """
+    for feature in (name for name in (ACTION, OBS_STATE) if name in meta.features):
+        size = math.prod(meta.features[feature]["shape"])
+        for name in ("min", "max", "mean", "std"):
+            try:
+                values = np.asarray(meta.stats[feature][name], dtype=np.float64)
+            except (LookupError, TypeError, ValueError):  # missing, or no numbers
+                values = np.empty(0)
+            if values.size == size and np.isfinite(values).all():
+                continue
+            if _tables(meta):
+                keys = (feature, "task_index", "episode_index", "frame_index")
+                check_finite_columns({key: frame_values(meta, key) for key in keys}, meta)
+            raise DatasetError(
+                f"{meta.root / STATS_PATH}: {name} of {feature} is {brief(values.tolist())}; expected {size} finite "
+                f"numbers, which scale it: {RECOMPUTE}."
+            )

@@ -13,7 +13,6 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_tools import modify_features
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import OBS_LATENT, OBS_STATE
 from lerobot_wm.data.cache import cache_root
@@ -23,6 +22,7 @@ from lerobot_wm.data.tables import check_finite_dataset
 from lerobot_wm.encode.batches import LatentBatches, episode_batches
 from lerobot_wm.files import appears_whole, sole_writer
 from lerobot_wm.policies.common.checks import OWN_NAMES, check_reads, names_before, renamed
+from lerobot_wm.policies.common.config import policy_features
 from lerobot_wm.policies.latent.policy import EncoderPolicy, LatentPolicy, encoder_fingerprint, load_encoder
 from lerobot_wm.system import quiet
 from lerobot_wm.workers import Job, parts_folder
@@ -137,7 +137,7 @@ def latent_record(
     policy: EncoderPolicy, source: LeRobotDataset, rename_map: Mapping[str, str], sample_seed: int | None
 ) -> LatentRecord:
     """The record of the latents that `encode` would make."""
-    features = renamed(dataset_to_policy_features(source.meta.features), rename_map)
+    features = renamed(policy_features(source.meta), rename_map)
     return LatentRecord(
         world_model_fingerprint=encoder_fingerprint(policy.world_model),
         source_repo_id=source.repo_id,

@@ -63,7 +63,7 @@ def dream_of(cfg: DreamConfig) -> Dreams:
     """
     policy = load_world_model(cfg.policy.path)
     with quiet():
-        meta = cfg.dataset.metadata()
+        meta = cfg.dataset.metadata([cfg.episode])
         check_features(policy, meta)
         [episode] = read_episodes(policy, meta, cfg.dataset, [cfg.episode], _count_frames(cfg, meta))
     dreams = dream(policy, episode, cfg.context)

@@ -166,7 +166,7 @@ def replay(cfg: ReplayConfig) -> Replay:
         ValueError: An episode does not exist, or a policy cannot read the dataset.
     """
     with quiet():
-        meta = cfg.dataset.metadata()
+        meta = cfg.dataset.metadata(cfg.episodes)
         paths = [cfg.policy.path, *cfg.compare]
         policies = [Replayed(name, path, meta) for name, path in zip(_names(paths), paths, strict=True)]
         trained = trained_episodes(cfg.policy.path, meta)
@@ -350,7 +350,7 @@ def main() -> None:
     cfg = draccus.parse(ReplayConfig)
     result = replay(cfg)
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
-    fps = cfg.dataset.metadata().fps
+    fps = cfg.dataset.metadata(cfg.episodes).fps
     for episode in result.recorded:
         figure = replay_figure(result, episode, fps)
         (cfg.output_dir / f"episode_{episode}.png").write_bytes(figure_bytes(figure, PNG))

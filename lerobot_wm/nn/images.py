@@ -9,6 +9,12 @@ from torch.nn import functional as F
 _LEVELS = 255  # steps between black and white
 
 
+def channels_first(shape: Sequence[int]) -> tuple[int, int, int]:
+    """The (C, H, W) of an image whose channels come first or last: it has fewer channels than rows and columns."""
+    first, second, third = shape
+    return (first, second, third) if first <= third else (third, first, second)
+
+
 def random_crop(images: Tensor, pad: int) -> Tensor:
     """Shift each image by up to `pad` pixels on both axes: replicate its border, then crop at a random place.
 

@@ -55,7 +55,8 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
         ValueError: The dataset is damaged, or does not fit the policy; nothing was encoded.
     """
     policy = cfg.policy
-    meta = open_dataset(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
+    where = (cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
+    meta = open_dataset(*where, cfg.dataset.episodes)
     if not isinstance(policy, PolicyConfig):
         return
     check_fit(policy, meta, cfg.rename_map)
@@ -66,6 +67,7 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
         revision = f"@{policy.pretrained_revision}" if policy.pretrained_revision else ""
         encoder = f"{policy.pretrained_path}{revision}"
     if encoder is not None:
+        open_dataset(*where)  # all episodes are encoded
         encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device), cfg.rename_map)
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None

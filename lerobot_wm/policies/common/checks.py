@@ -10,7 +10,6 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.utils import STATS_PATH
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import ACTION, OBS_LATENT
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
@@ -20,6 +19,7 @@ from lerobot_wm.policies.common.config import (
     check_cameras_present,
     check_tasks,
     image_keys,
+    policy_features,
     train_new,
 )
 
@@ -86,7 +86,7 @@ def check_sizes(
     Raises:
         ValueError: A size differs; names both.
     """
-    features = renamed(dataset_to_policy_features(dataset_meta.features), rename_map)
+    features = renamed(policy_features(dataset_meta), rename_map)
     for key in filter(features.__contains__, _vectors(config)):
         known = (config.output_features if key == ACTION else config.input_features)[key].shape
         if known != features[key].shape:
@@ -158,7 +158,7 @@ def dataset_cameras(config: PolicyConfig, dataset_meta: LeRobotDatasetMetadata) 
     Names are those inside `names_given_by`. Under lerobot-train, which does not tell them, cameras that all have one
     size need none.
     """
-    features = dataset_to_policy_features(dataset_meta.features)
+    features = policy_features(dataset_meta)
     shapes = {features[key].shape for key in image_keys(features)}
     alike = {key: PolicyFeature(FeatureType.VISUAL, *shapes) for key in config.cameras if len(shapes) == 1}
     known = renamed(features, current_names())

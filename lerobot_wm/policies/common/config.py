@@ -8,8 +8,10 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.optim import LRSchedulerConfig
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot_wm.nn.images import channels_first
 from lerobot_wm.policies.common.optim import FinalDecayConfig, FusedAdamConfig
 
 # Scaling is part of our models (lerobot_wm.nn.normalize): a policy and the frozen world model inside it are fitted to
@@ -138,6 +140,11 @@ class PolicyConfig(PreTrainedConfig):
                 f"--policy.image_key is {self.image_key!r}; the dataset has the cameras {', '.join(known) or 'none'}. "
                 f"{self.type} needs at least one: set --policy.image_key to some of these, separated by commas, "
                 "without repeating any."
+            )
+        # LeRobot takes axes for (C, H, W) unless the last one is called "channel" or "channels".
+        for key in chosen:
+            self.input_features[key] = PolicyFeature(
+                FeatureType.VISUAL, channels_first(self.input_features[key].shape)
             )
         channels = {key: self.input_features[key].shape[0] for key in chosen}
         if len(set(channels.values())) > 1:
@@ -328,6 +335,16 @@ def feature_dim(features: dict[str, PolicyFeature], key: str) -> int:
             "single one. Record it with a second number, which may be constant."
         )
     return size
+
+
+def policy_features(dataset_meta: LeRobotDatasetMetadata) -> dict[str, PolicyFeature]:
+    """LeRobot's description of a dataset's features, with the channels of all cameras first."""
+    features = dataset_to_policy_features(dataset_meta.features)
+    cameras = {
+        key: PolicyFeature(FeatureType.VISUAL, channels_first(features[key].shape))
+        for key in image_keys(features)
+    }
+    return features | cameras
 
 
 def image_keys(features: dict[str, PolicyFeature]) -> list[str]:

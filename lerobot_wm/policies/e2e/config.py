@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import OBS_STATE
-from lerobot_wm.policies.common.config import ActingConfig
+from lerobot_wm.policies.common.config import ActingConfig, policy_features
 
 ENCODERS = ("small", "resnet18", "resnet34")
 
@@ -48,7 +47,7 @@ class E2EConfig(ActingConfig):
     def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Take the tasks and the cameras' sizes."""
         super().fill_from_dataset(dataset_meta)
-        found = dataset_to_policy_features(dataset_meta.features)
+        found = policy_features(dataset_meta)
         for key in self.input_features.keys() & found.keys():
             self.input_features[key] = found[key]
 
