@@ -225,7 +225,7 @@ def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial:
             raise DatasetError(
                 f"{path}: the timestamps are not those of {meta.fps:g} frames per second, which is fps in {INFO_PATH}; "
                 f"the median step is {step:.4f} s, {1 / step if step > 0 else 0:.1f} per second. If fps is wrong, "
-                f"correct it there. If frames are {meta.fps:g} per second, {how_to_repair(meta.repo_id, meta.root)}."
+                f"correct it there. If they are the times of a clock, {how_to_repair(meta.repo_id, meta.root)}."
             )
 
 

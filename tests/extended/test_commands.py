@@ -65,6 +65,7 @@ def test_the_commands_work_as_written(
     ):
         assert Path("outputs", made).exists(), made
     assert Path("data/mt6_dense/meta/info.json").is_file()
+    assert Path("data/mt6_repaired/meta/info.json").is_file()
 
 
 def test_every_command_is_in_the_table() -> None:
