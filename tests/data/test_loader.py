@@ -243,24 +243,16 @@ def test_image_transforms_are_refused(demos_root: Path) -> None:
         RamDataset(dataset, CPU)
 
 
-def test_frames_are_decoded_some_at_a_time_and_by_no_shared_decoder(
-    demos_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_of_videos_are_those_that_lerobot_decodes(demos_root: Path) -> None:
     dataset = LeRobotDataset("test/demos", root=demos_root)
-    whole = camera_frames(dataset, "observation.image").clone()
-    asked: list[int] = []
-
-    def counted(path: Path, timestamps: list[float], *args: Any, **kwargs: Any) -> torch.Tensor:
-        asked.append(len(timestamps))
-        return decode_video_frames(path, timestamps, *args, **kwargs)
-
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    monkeypatch.setattr("lerobot_wm.data.cache.decode_video_frames", counted)
-    monkeypatch.setattr("lerobot_wm.data.cache._CHUNK_BYTES", 30 * 64 * 64 * 3)
-    # As where torchcodec is installed, for which LeRobot keeps one decoder for all threads.
-    monkeypatch.setattr("lerobot.datasets.video_utils.get_safe_default_video_backend", lambda: "torchcodec")
-    assert torch.equal(camera_frames(dataset, "observation.image"), whole)
-    assert max(asked) == 30
+    key, meta = "observation.image", dataset.meta
+    frames = camera_frames(dataset, key).movedim(-1, 1)  # (N, C, H, W)
+    for episode in meta.episodes:
+        rows = range(episode["dataset_from_index"], episode["dataset_to_index"])
+        times = [episode[f"videos/{key}/from_timestamp"] + t / meta.fps for t in range(len(rows))]
+        path = demos_root / meta.get_video_file_path(episode["episode_index"], key)
+        theirs = decode_video_frames(path, times, 1e-4, backend="pyav", return_uint8=True)
+        assert torch.equal(frames[rows.start : rows.stop], theirs)
 
 
 def test_a_dataset_is_hashed_again_only_when_it_changes(
