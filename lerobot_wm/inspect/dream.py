@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, TASK
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, TASK
 from lerobot_wm.inspect.episodes import ImaginingPolicy, filter_frames, reward_key, rssm_of, stack_episodes
 from lerobot_wm.inspect.open_loop import psnr
 from lerobot_wm.nn.images import camera_images
@@ -136,13 +136,14 @@ def _act(policy: LatentPolicy, state: RSSMState, last: dict[str, Any], n_steps: 
     world_model = rssm_of(policy)
     tasks = policy.one_hot_tasks(last, 1)  # (1, N)
     env_state = last[OBS_ENV_STATE] if policy.config.use_environment_state else None
-    proprio, reached = last[OBS_STATE], policy.config.relative_indices
+    proprio = policy.state_at(last)
+    targets, reached = policy.config.relative_indices, policy.config.relative_state_indices
     latents = []
     for _ in range(n_steps):
         action = policy.act(policy.observation(proprio, tasks, state.latent, env_state), proprio)  # (1, A)
         # Where the action is a target for the state, the state is imagined to reach it.
         proprio = proprio.clone()
-        proprio[:, reached] = action[:, reached]
+        proprio[:, reached] = action[:, targets]
         state = world_model.imagine(state, action[:, None]).last()
         latents.append(state.latent)
     return torch.stack(latents, dim=1)
