@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from lerobot_wm.constants import TASK
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.inspect.dream import Dreams, dream, strip_figure, write_dream
+from lerobot_wm.inspect.dream import Dreams, actions_are_targets, dream, strip_figure, write_dream
 from lerobot_wm.inspect.episodes import ImaginingPolicy, episodes_by_task, read_episodes
 from lerobot_wm.inspect.open_loop import CONTEXT
 from lerobot_wm.inspect.pictures import MP4, PNG, SVG, data_uri, figure_uri
@@ -65,8 +65,9 @@ def dream_clips(
     if not chosen:
         return []
     episodes = read_episodes(policy, meta, source, chosen, MAX_FRAMES)
+    hold = actions_are_targets(meta)
     return [
-        _clip(dream(policy, episode, CONTEXT), episode[TASK], index, meta.fps)
+        _clip(dream(policy, episode, CONTEXT, hold_action=hold), episode[TASK], index, meta.fps)
         for index, episode in zip(tqdm(chosen, desc="Dreaming", unit="episode"), episodes, strict=True)
     ]
 

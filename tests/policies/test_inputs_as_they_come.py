@@ -13,6 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.inspect.dream import HELD_ACTION, OWN_ACTIONS, TRUE_ACTIONS, ZERO_ACTIONS
 from lerobot_wm.inspect.dream_command import DreamConfig, dream_of
 from lerobot_wm.inspect.episodes import CheckpointConfig
 from lerobot_wm.inspect.replay import ReplayConfig, replay
@@ -94,7 +95,7 @@ def test_policies_act_without_proprioception_on_one_number(stateless: LeRobotDat
         assert all(actions[1].shape == (10, 1) for actions in replayed.actions.values())
         if kind.startswith("wm"):
             cfg = DreamConfig(CheckpointConfig(str(path)), source, 1, output_dir=path.parent / "dream")
-            assert "policy's actions" in dream_of(cfg).by_actions
+            assert list(dream_of(cfg).by_actions) == [TRUE_ACTIONS, ZERO_ACTIONS, OWN_ACTIONS]
 
 
 def test_a_policy_that_would_see_nothing_is_refused(stateless: LeRobotDataset, train: Train) -> None:
@@ -130,6 +131,15 @@ def test_vectors_are_joined_in_the_order_of_state_keys(
         get_policy_class("e2e_bc").from_pretrained(path, config=config)
     with pytest.raises(ValueError, match=r"observation\.torque.*observation\.effort"):
         train(rich, "e2e_bc", "--policy.state_keys=observation.torque")
+
+
+def test_targets_are_held_in_dreams_in_place_of_zero(rich: LeRobotDataset, train: Train) -> None:
+    _, path = train(rich, "wm_rssm", "--policy.window_length=4")
+    source = SourceConfig("test/recorded", str(rich.root))
+    cfg = DreamConfig(CheckpointConfig(str(path)), source, 1, output_dir=path.parent / "dream")
+    dreams = dream_of(cfg)
+    assert list(dreams.by_actions) == [TRUE_ACTIONS, HELD_ACTION]
+    assert len(dreams.by_actions[HELD_ACTION].images) == 10
 
 
 def test_colour_and_the_state_are_read_by_default_and_the_rest_is_named(

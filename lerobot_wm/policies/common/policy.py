@@ -24,6 +24,7 @@ from lerobot_wm.policies.common.card import TrainingData, model_card
 from lerobot_wm.policies.common.checkpoint import WHOLE, CheckpointError, cut_short, not_finite, read_config
 from lerobot_wm.policies.common.checks import (
     check_has_stats,
+    check_names,
     check_sizes,
     current_names,
     dataset_cameras,
@@ -79,6 +80,7 @@ class BasePolicy(PreTrainedPolicy):
         """
         super().__init__(config)
         if dataset_meta is not None:
+            check_names(dataset_meta)
             check_has_stats(dataset_meta)
             config.fill_from_dataset(dataset_meta)
         config.validate_features()
