@@ -133,8 +133,9 @@ def dream(
     # The action executed at the last frame seen leads to the first imagined one.
     true_actions = batch[ACTION][:, context - 1 : -1]  # (1, T - context, A)
     if hold_action:
-        last = max(context - 2, 0)  # the frame of the last action that the model saw
-        idle, still = HELD_ACTION, batch[ACTION][:, last : last + 1].expand_as(true_actions)
+        # Of the frame before the last one seen.
+        held = batch[ACTION][:, max(context - 2, 0)]  # (1, A)
+        idle, still = HELD_ACTION, held[:, None].expand_as(true_actions)
     else:
         idle, still = ZERO_ACTIONS, torch.zeros_like(true_actions)
     latents = {
