@@ -15,7 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import write_table_one_row_group_per_episode
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import DEFAULT_FEATURES, EPISODES_DIR, INFO_PATH, STATS_PATH
+from lerobot.datasets.utils import EPISODES_DIR, INFO_PATH, STATS_PATH
+from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_wm.data.source import SourceConfig

@@ -10,10 +10,10 @@ from types import MappingProxyType
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.utils import DEFAULT_FEATURES, STATS_PATH
+from lerobot.datasets.utils import STATS_PATH
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.utils.constants import OBS_STR
+from lerobot.utils.constants import DEFAULT_FEATURES, OBS_STR
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_wm.constants import ACTION, OBS_IMAGES, OBS_LATENT, OBS_STATE
