@@ -16,12 +16,11 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, TASK
-from lerobot_wm.data.tables import relative_to_state
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, TASK
+from lerobot_wm.data.tables import last_action_predicts_next, relative_to_state
 from lerobot_wm.inspect.episodes import ImaginingPolicy, filter_frames, reward_key, rssm_of, stack_episodes
 from lerobot_wm.inspect.open_loop import psnr
 from lerobot_wm.nn.images import camera_images
-from lerobot_wm.policies.common.policy import statistics
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.world_model.rssm import RSSMState
 
@@ -95,16 +94,8 @@ class Dreams:
 
 
 def actions_are_targets(meta: LeRobotDatasetMetadata) -> bool:
-    """Whether a dataset's actions are targets such as joint positions, for which zero is a command like any other.
-
-    They are where they are near the state. Where there is no state of their size, they are if zero lies outside the
-    range of one of their numbers.
-    """
-    sizes = [meta.features.get(key, {}).get("shape") for key in (ACTION, OBS_STATE)]
-    if sizes[0] == sizes[1]:
-        return bool(relative_to_state(meta))
-    low, high = statistics(meta.stats or {}, ACTION, "min", "max")  # (A,)
-    return bool(((low > 0) | (high < 0)).any())
+    """Whether a dataset's actions are targets such as joint positions, for which zero is a command like any other."""
+    return bool(relative_to_state(meta)) or last_action_predicts_next(meta)
 
 
 @torch.no_grad()

@@ -105,7 +105,8 @@ def check_base_is_kept(policy: PreTrainedConfig) -> None:
 @parser.wrap()
 def train(cfg: TrainPipelineConfig) -> None:
     """Train any LeRobot policy as `lerobot-train` does, from the same flags, into the same checkpoints."""
-    if cfg.rename_map and not cfg.resume and parser.get_path_arg("policy") is None:
+    is_new = cfg.policy is not None and cfg.policy.pretrained_path is None and not cfg.resume
+    if cfg.rename_map and is_new and parser.get_path_arg("policy") is None:
         raise ValueError(
             "--rename_map gives a dataset the names that a checkpoint was trained with (--policy.path). A new policy "
             "takes the dataset's own names; to change these, make a copy: "
