@@ -85,6 +85,7 @@ class LatentPolicyConfig(ActingConfig):
             self.world_model = None
         elif self.world_model is None:
             self._take_world_model()
+        _ = self.state_dim, self.env_state_dim
         read = {*self.state_vectors, *self.cameras, OBS_ENV_STATE if self.use_environment_state else None}
         if self.world_model is not None:
             read |= set(self.world_model.proprio_vectors)
@@ -94,7 +95,6 @@ class LatentPolicyConfig(ActingConfig):
                 "--policy.use_latent=false, and the dataset has no proprioception for --policy.state_keys: this policy "
                 "would see nothing."
             )
-        _ = self.state_dim, self.env_state_dim
         model = self.world_model
         if self.save_predicted_video and (model is None or not model.predicts_images):
             raise ValueError(
