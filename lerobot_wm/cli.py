@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "expert": ("lerobot_wm.commands.expert", "rollouts of the scripted expert -> records"),
     "relabel": ("lerobot_wm.commands.relabel", "copy of a dataset with another column as its reward"),
     "repair": ("lerobot_wm.commands.repair", "copy of a LeRobot 2 or wrongly timed dataset, repaired"),
+    "rename": ("lerobot_wm.commands.rename", "copy of a dataset with other names for its features"),
     "init": ("lerobot_wm.commands.init", "checkpoint of an untrained world model or a frozen image backbone"),
     "train": ("lerobot_wm.train.command", "lerobot-train with its flags, fed from RAM or GPU memory"),
     "encode": ("lerobot_wm.encode.command", "image dataset + frozen world model -> latent LeRobotDataset"),

@@ -48,11 +48,13 @@ def record(
         for t in range(length):
             frame: dict[str, Any] = {"task": task, **labels(t, length)}
             for key, feature in features.items():
+                if key in frame:
+                    continue
                 if feature["dtype"] in ("image", "video"):
                     height, width, _ = feature["shape"]
                     blocks = np.repeat(np.repeat(colours, height // 4, 0), width // 4, 1)
                     frame[key] = np.roll(blocks, 3 * t, axis=1)
-                elif key not in frame:
+                else:
                     frame[key] = rng.standard_normal(feature["shape"]).astype(feature["dtype"])
             dataset.add_frame(frame)
         dataset.save_episode()

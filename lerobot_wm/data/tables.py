@@ -116,7 +116,7 @@ def relative_to_state(meta: LeRobotDatasetMetadata, state_key: str = OBS_STATE) 
     shapes = [tuple(meta.features.get(key, {"shape": ()})["shape"]) for key in (ACTION, state_key)]
     if shapes[0] != shapes[1] or not _tables(meta):
         return []
-    action, state = frame_values(meta, ACTION), frame_values(meta, state_key)  # (N, A)
+    action, state = (frame_values(meta, key).view(-1, *shapes[0]) for key in (ACTION, state_key))  # (N, A)
     spread = action.std(0)
     chosen = (spread > 0) & ((action - state).std(0) <= _RELATIVE_SPREAD * spread)  # (A,)
     return chosen.nonzero().flatten().tolist()

@@ -16,13 +16,14 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from tqdm import tqdm
 
-from lerobot_wm.constants import ACTION, OBS_LATENT, OBS_STATE
+from lerobot_wm.constants import ACTION, OBS_LATENT
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.tables import column_tensor
 from lerobot_wm.files import appears_whole
 from lerobot_wm.nn.images import stack_images
 from lerobot_wm.policies.common.checks import OWN_NAMES, names_before
-from lerobot_wm.policies.latent.policy import EncoderPolicy
+from lerobot_wm.policies.common.policy import join_vectors
+from lerobot_wm.policies.latent.policy import EncoderPolicy, encoder_config
 from lerobot_wm.workers import check_same_settings
 
 _EPISODES_PER_BATCH = 16
@@ -67,24 +68,26 @@ def filter_batches(
     cameras = [camera_frames(dataset, key, image_size) for key in camera_keys]
     all_lengths = source.meta.episodes["length"][:]
     lengths = [all_lengths[episode] for episode in episodes]
-    # For each column, the rows of each episode.
-    index, actions, proprio = (
-        dict(zip(episodes, _column(dataset, key).split(lengths), strict=True))
-        for key in ("index", ACTION, *names_before([OBS_STATE], rename_map))
-    )
+
+    def by_episode(values: Tensor) -> dict[int, Tensor]:
+        return dict(zip(episodes, values.split(lengths), strict=True))
+
+    index = by_episode(_column(dataset, "index").flatten())
+    actions = by_episode(_column(dataset, ACTION))
+    vectors = names_before(encoder_config(policy).proprio_vectors, rename_map)
+    joined = join_vectors({key: _column(dataset, key) for key in vectors}, vectors)
+    proprio = None if joined is None else by_episode(joined)
     for batch in batches:
         embeds = []
         for episode in batch:
             chunks = [
                 world_model.embed(
-                    stack_images([_images(frames[i].to(device)) for frames in cameras], image_size)[None],
-                    p[None],
+                    stack_images(
+                        [_images(frames[index[episode][rows]].to(device)) for frames in cameras], image_size
+                    )[None],
+                    None if proprio is None else proprio[episode][rows][None].to(device),
                 )[0]
-                for i, p in zip(
-                    index[episode].split(_FRAMES_PER_CHUNK),
-                    proprio[episode].to(device).split(_FRAMES_PER_CHUNK),
-                    strict=True,
-                )
+                for rows in torch.arange(len(index[episode])).split(_FRAMES_PER_CHUNK)
             ]
             embeds.append(torch.cat(chunks))  # (T, E)
         # The filter is causal: padding after the last frame of shorter episodes does not change their latents.
@@ -100,7 +103,9 @@ def filter_batches(
 
 
 def _column(dataset: LeRobotDataset, key: str) -> Tensor:
-    return column_tensor(dataset.hf_dataset, key, tuple(dataset.meta.features[key]["shape"]))
+    """(N, *shape)."""
+    shape = tuple(dataset.meta.features[key]["shape"])
+    return column_tensor(dataset.hf_dataset, key, shape).view(-1, *shape)
 
 
 def _images(frames: Tensor) -> Tensor:

@@ -14,16 +14,21 @@ from lerobot.datasets.dataset_tools import modify_features
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.constants import OBS_LATENT, OBS_STATE
+from lerobot_wm.constants import OBS_LATENT
 from lerobot_wm.data.cache import cache_root
 from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
 from lerobot_wm.data.source import dataset_folder, is_snapshot
 from lerobot_wm.data.tables import check_finite_dataset
 from lerobot_wm.encode.batches import LatentBatches, episode_batches
 from lerobot_wm.files import appears_whole, sole_writer
-from lerobot_wm.policies.common.checks import OWN_NAMES, check_reads, names_before, renamed
+from lerobot_wm.policies.common.checks import OWN_NAMES, check_reads, renamed
 from lerobot_wm.policies.common.config import policy_features
-from lerobot_wm.policies.latent.policy import EncoderPolicy, LatentPolicy, encoder_fingerprint, load_encoder
+from lerobot_wm.policies.latent.policy import (
+    EncoderPolicy,
+    encoder_config,
+    encoder_fingerprint,
+    load_encoder,
+)
 from lerobot_wm.system import quiet
 from lerobot_wm.workers import Job, parts_folder
 
@@ -121,14 +126,7 @@ def _begin(
                 shutil.rmtree(folder, ignore_errors=True)
         raise FileExistsError(f"{output_root} already exists: choose another --output_root, or remove it.")
     # A policy on latents reads more than its world model does.
-    model = policy.config.world_model if isinstance(policy, LatentPolicy) else policy.config
-    assert model is not None  # a policy with a world model
-    check_reads(model, source.meta, rename_map)
-    [state] = names_before([OBS_STATE], rename_map)
-    if state not in source.meta.features:
-        raise ValueError(
-            f"{source.repo_id} has no '{state}', which every policy on latents reads beside them."
-        )
+    check_reads(encoder_config(policy), source.meta, rename_map)
     names = {"rename_map": json.dumps(dict(rename_map), sort_keys=True)}
     return record, LatentBatches(folder, record.made_of | names)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.io_utils import write_video
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,7 +16,8 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, TASK
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, TASK
+from lerobot_wm.data.tables import last_action_predicts_next, relative_to_state
 from lerobot_wm.inspect.episodes import ImaginingPolicy, filter_frames, reward_key, rssm_of, stack_episodes
 from lerobot_wm.inspect.open_loop import psnr
 from lerobot_wm.nn.images import camera_images
@@ -23,8 +25,14 @@ from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.world_model.rssm import RSSMState
 
 TRUE_ACTIONS, ZERO_ACTIONS, OWN_ACTIONS = "true actions", "zero actions", "policy's actions"
+HELD_ACTION = "held action"  # in place of zero actions, where actions are targets such as joint positions
 # Colour-blind safe (Okabe and Ito 2008), blue as on the page. Dashes leave equal curves visible.
-STYLES = {TRUE_ACTIONS: ("#2f6fde", "-"), ZERO_ACTIONS: ("#d55e00", "--"), OWN_ACTIONS: ("#009e73", ":")}
+STYLES = {
+    TRUE_ACTIONS: ("#2f6fde", "-"),
+    ZERO_ACTIONS: ("#d55e00", "--"),
+    HELD_ACTION: ("#d55e00", "--"),
+    OWN_ACTIONS: ("#009e73", ":"),
+}
 # Imagined steps in a strip, at most.
 STEPS_SHOWN = 8
 # Players blur small images: a video's are enlarged by a whole factor up to this width in pixels.
@@ -85,19 +93,27 @@ class Dreams:
         return psnr((images - self.truth[self.context :]).square().mean().item())
 
 
+def actions_are_targets(meta: LeRobotDatasetMetadata) -> bool:
+    """Whether a dataset's actions are targets such as joint positions, for which zero is a command like any other."""
+    return bool(relative_to_state(meta)) or last_action_predicts_next(meta)
+
+
 @torch.no_grad()
-def dream(policy: ImaginingPolicy, episode: dict[str, Any], context: int) -> Dreams:
+def dream(
+    policy: ImaginingPolicy, episode: dict[str, Any], context: int, *, hold_action: bool = False
+) -> Dreams:
     """Filter the first frames of an episode and imagine the others, always taking the mean of z_t.
 
     The kinds of action are those of the episode, zero in the environment's units (no command), and, for a policy, the
-    actions it chooses from each imagined latent. The policy's proprioception, and full state if it reads that, stay as
-    they were at the last frame seen: the world model does not predict them, and the dataset's own would tell the policy
-    where the demonstration went.
+    actions it chooses from each imagined latent. With `hold_action`, the last action seen replaces zero. The policy's
+    proprioception, and full state if it reads that, stay as they were at the last frame seen: the world model does not
+    predict them, and the dataset's own would tell the policy where the demonstration went.
 
     Args:
         policy: Holds the world model.
         episode: Its first T frames, as `read_episodes` yields them.
         context: How many of them the model sees.
+        hold_action: See `actions_are_targets`.
 
     Raises:
         ValueError: The policy does not know the task.
@@ -107,9 +123,15 @@ def dream(policy: ImaginingPolicy, episode: dict[str, Any], context: int) -> Dre
     seen = filter_frames(policy, batch, context)
     # The action executed at the last frame seen leads to the first imagined one.
     true_actions = batch[ACTION][:, context - 1 : -1]  # (1, T - context, A)
+    if hold_action:
+        # Of the frame before the last one seen.
+        held = batch[ACTION][:, max(context - 2, 0)]  # (1, A)
+        idle, still = HELD_ACTION, held[:, None].expand_as(true_actions)
+    else:
+        idle, still = ZERO_ACTIONS, torch.zeros_like(true_actions)
     latents = {
         TRUE_ACTIONS: world_model.imagine(seen.last(), true_actions).latent,
-        ZERO_ACTIONS: world_model.imagine(seen.last(), torch.zeros_like(true_actions)).latent,
+        idle: world_model.imagine(seen.last(), still).latent,
     }
     if isinstance(policy, LatentPolicy):
         last = {key: value[:, context - 1] for key, value in batch.items()} | {TASK: [episode[TASK]]}
@@ -136,13 +158,14 @@ def _act(policy: LatentPolicy, state: RSSMState, last: dict[str, Any], n_steps: 
     world_model = rssm_of(policy)
     tasks = policy.one_hot_tasks(last, 1)  # (1, N)
     env_state = last[OBS_ENV_STATE] if policy.config.use_environment_state else None
-    proprio, reached = last[OBS_STATE], policy.config.relative_indices
+    proprio = policy.state_at(last)
+    targets, reached = policy.config.relative_indices, policy.config.relative_state_indices
     latents = []
     for _ in range(n_steps):
         action = policy.act(policy.observation(proprio, tasks, state.latent, env_state), proprio)  # (1, A)
         # Where the action is a target for the state, the state is imagined to reach it.
         proprio = proprio.clone()
-        proprio[:, reached] = action[:, reached]
+        proprio[:, reached] = action[:, targets]
         state = world_model.imagine(state, action[:, None]).last()
         latents.append(state.latent)
     return torch.stack(latents, dim=1)

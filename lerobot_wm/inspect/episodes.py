@@ -9,12 +9,13 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_STATE, TASK
+from lerobot_wm.constants import ACTION, TASK
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.nn.images import camera_images, resize_images
 from lerobot_wm.policies.common.checks import check_reads
 from lerobot_wm.policies.common.config import check_cameras_present
-from lerobot_wm.policies.latent.policy import LatentPolicy, load_encoder
+from lerobot_wm.policies.common.policy import join_vectors
+from lerobot_wm.policies.latent.policy import LatentPolicy, encoder_config, load_encoder
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.model import WorldModel
@@ -56,7 +57,7 @@ def rssm_of(policy: ImaginingPolicy) -> WorldModel:
 
 def world_model_config(policy: ImaginingPolicy) -> WMRSSMConfig:
     """The configuration that the policy's world model was trained with."""
-    config = policy.config if isinstance(policy, WMRSSMPolicy) else policy.config.world_model
+    config = encoder_config(policy)
     assert isinstance(config, WMRSSMConfig)
     return config
 
@@ -136,6 +137,8 @@ def read_episodes(
                 chunk = window[key][: n_frames - position]
                 if key in policy.config.cameras:
                     chunk = resize_images(chunk, policy.config.image_size)
+                elif tuple(meta.features[key]["shape"]) == (1,) and key != reward_key(policy):
+                    chunk = chunk[:, None]
                 chunks[key].append(chunk)
         yield {key: torch.cat(of_key) for key, of_key in chunks.items()} | {TASK: tasks[episode][0]}
         start += length
@@ -155,7 +158,6 @@ def filter_frames(
     """Filter the first `n_frames` of stacked episodes, taking z_t at its posterior mean."""
     frames = {key: value[:, :n_frames] for key, value in batch.items()}
     world_model = rssm_of(policy)
-    proprio = frames[OBS_STATE] if world_model.config.use_proprio else None
-    return world_model.filter(
-        camera_images(frames, policy.config.cameras, policy.config.image_size), frames[ACTION], proprio
-    )
+    images = camera_images(frames, policy.config.cameras, policy.config.image_size)
+    proprio = join_vectors(frames, world_model_config(policy).proprio_vectors)
+    return world_model.filter(images, frames[ACTION], proprio)

@@ -1,8 +1,9 @@
-"""`lerobot-wm quality`: how good a world model is, on positions that it was never trained on."""
+"""`lerobot-wm quality`: how good a world model is, on episodes that it was never trained on."""
 
 import json
 import logging
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import draccus
@@ -10,10 +11,22 @@ import torch
 
 from lerobot_wm.constants import QUALITY_NAME
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.inspect.episodes import episodes_by_task, load_world_model, rssm_of, world_model_config
+from lerobot_wm.inspect.episodes import (
+    ImaginingPolicy,
+    episodes_by_task,
+    load_world_model,
+    rssm_of,
+    world_model_config,
+)
 from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, WINDOW
 from lerobot_wm.inspect.pictures import PNG, SVG, figure_bytes
-from lerobot_wm.inspect.quality_episodes import Episode, filter_episodes, read_demonstrations, start_positions
+from lerobot_wm.inspect.quality_episodes import (
+    POSITIONS,
+    Episode,
+    filter_episodes,
+    read_demonstrations,
+    start_positions,
+)
 from lerobot_wm.inspect.quality_figures import EXAMPLES_NAME, examples_figure, quality_figures
 from lerobot_wm.inspect.quality_measures import (
     FOREGROUND_THRESHOLD,
@@ -27,6 +40,7 @@ from lerobot_wm.inspect.quality_measures import (
 )
 from lerobot_wm.inspect.quality_probes import FRAMES_PER_EPISODE, draw_frames, probe_positions, probe_task
 from lerobot_wm.nn.images import side_by_side
+from lerobot_wm.policies.common.checks import check_reads
 from lerobot_wm.records import provenance
 from lerobot_wm.world_model.model import WorldModel
 
@@ -42,10 +56,11 @@ class QualityConfig:
 
     Args:
         world_model_path: Folder or Hub id of a wm_rssm, wm_bc or wm_iql checkpoint.
-        dataset: Episodes of `lerobot-wm collect` to judge it on, of variations that it was not trained on.
+        dataset: Episodes to judge it on, that it was not trained on; in Meta-World of other variations.
         output_dir: Where quality.json and the figures are written.
         train_dataset: What it was trained on: probes are fitted to its episodes of the tasks of `dataset`, all of which
-            it must have. Without it, probes are fitted and tested on `dataset` by cross-validation over variations.
+            it must have. Without it, probes are fitted and tested on `dataset` by cross-validation over variations, or
+            over episodes where the dataset has none.
         seed: Seed of every random choice.
         episodes_per_task: Episodes of each task of `dataset`, spread over its variations.
     """
@@ -69,8 +84,9 @@ def quality(cfg: QualityConfig) -> Path:
     """
     policy = load_world_model(cfg.world_model_path)
     world_model, cameras = rssm_of(policy), policy.config.cameras
-    training, episodes = _read_datasets(cfg, cameras)
-    n_seen = _count_seen(training, episodes)
+    training, episodes = _read_datasets(cfg, policy)
+    n_seen = _count_seen(training, episodes) if set(episodes[0].targets) == set(POSITIONS) else None
+    knows_success = all(episode.success is not None for episode in episodes)
     window_length = world_model_config(policy).window_length
 
     logger.info("Filtering %d episodes", len(training) + len(episodes))
@@ -107,7 +123,7 @@ def quality(cfg: QualityConfig) -> Path:
         },
         "open_loop": summarise(image_errors(images, tasks, median_image)),
         "reward": reward_quality(world_model, episodes, filtered)
-        if world_model.config.predict_reward
+        if world_model.config.predict_reward and knows_success
         else None,
         "probes": probe_positions(frames),
         "task_probe": probe_task(frames),
@@ -124,13 +140,22 @@ def quality(cfg: QualityConfig) -> Path:
     return path
 
 
-def _read_datasets(cfg: QualityConfig, cameras: list[str]) -> tuple[list[Episode], list[Episode]]:
+def _read_datasets(cfg: QualityConfig, policy: ImaginingPolicy) -> tuple[list[Episode], list[Episode]]:
     """Episodes of the training data, if it is given, and those to judge on."""
+    config = world_model_config(policy)
+    read = partial(
+        read_demonstrations,
+        cameras=config.cameras,
+        seed=cfg.seed,
+        proprio=config.proprio_vectors,
+        reward_key=config.reward_key,
+    )
+    check_reads(config, cfg.dataset.metadata())
     training = []
     if cfg.train_dataset is not None:
         tasks = _check_tasks(cfg.train_dataset, cfg.dataset)
-        training = read_demonstrations(cfg.train_dataset, cameras, PROBE_EPISODES_PER_TASK, cfg.seed, tasks)
-    episodes = read_demonstrations(cfg.dataset, cameras, cfg.episodes_per_task, cfg.seed)
+        training = read(cfg.train_dataset, per_task=PROBE_EPISODES_PER_TASK, of_tasks=tasks)
+    episodes = read(cfg.dataset, per_task=cfg.episodes_per_task)
     n_long = sum(len(episode.actions) >= WINDOW for episode in episodes)
     if n_long < 2:
         raise ValueError(

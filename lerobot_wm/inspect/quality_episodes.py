@@ -1,27 +1,28 @@
 """Demonstrations in memory, and what the world model's filter makes of them."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from tqdm import trange
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, SUCCESS, VARIATION
+from lerobot_wm.constants import ACTION, ENV_STATE_DIM, OBS_ENV_STATE, REWARD, SUCCESS, VARIATION
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.data.tables import column_tensor
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.nn.images import stack_images
+from lerobot_wm.policies.common.policy import join_vectors
 from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import RSSMState
 
-NEEDED = (ACTION, OBS_STATE, OBS_ENV_STATE, SUCCESS, VARIATION)
-# First object and goal in Meta-World's 39-dimensional state.
-_POSITIONS = [4, 5, 6, 36, 37, 38]
+# Meta-World's 39-dimensional state (m): hand and first object at its start, the goal at its end.
+POSITIONS = {"object": slice(4, 7), "gripper": slice(0, 3), "goal": slice(36, 39)}
 _EPISODES_PER_BATCH = 16
 
 
@@ -31,21 +32,22 @@ class Episode:
 
     Attributes:
         task: The task.
-        variation: Which of its fixed variations.
+        variation: Which of its fixed variations, in Meta-World; elsewhere the episode's index.
         frames: Each camera's frames, (T, 64, 64, C) uint8, views of the memory-mapped cache.
         actions: (T, A).
-        proprio: (T, P).
-        env_state: (T, 39).
-        success: (T,) bool.
+        proprio: What the world model reads beside images, (T, P); None if nothing.
+        targets: What probes read from the latent, (T, ·) by name: Meta-World's positions (m), elsewhere the vectors of
+            the observation.
+        success: (T,) bool: `next.success`, or where the reward is 0 or 1 whether it is 1; None without.
     """
 
     task: str
     variation: int
     frames: list[Tensor]
     actions: Tensor
-    proprio: Tensor
-    env_state: Tensor
-    success: Tensor
+    proprio: Tensor | None
+    targets: dict[str, Tensor]
+    success: Tensor | None
 
     def images(self, steps: slice | list[int]) -> Tensor:
         """The images of these steps as the world model sees them, (N, C, 64, 64) in [0, 1]."""
@@ -96,8 +98,11 @@ def read_demonstrations(
     per_task: int,
     seed: int,
     of_tasks: Collection[str] | None = None,
+    *,
+    proprio: Sequence[str] = (),
+    reward_key: str = REWARD,
 ) -> list[Episode]:
-    """Read some episodes of a Meta-World dataset; no others are decoded.
+    """Read some episodes of a dataset; no others are decoded.
 
     Args:
         source: The dataset.
@@ -105,23 +110,24 @@ def read_demonstrations(
         per_task: Episodes of each task.
         seed: Seed of the choice, see `choose_episodes`.
         of_tasks: The tasks; None for all.
+        proprio: Vectors that the world model reads beside images.
+        reward_key: The reward, where there is no `next.success`.
 
     Raises:
         DatasetError: The dataset is damaged.
-        ValueError: The dataset lacks a feature, such as the objects' positions.
     """
     meta = source.metadata()
-    missing = [key for key in (*cameras, *NEEDED) if key not in meta.features]
-    if missing:
-        raise ValueError(
-            f"{source.repo_id} has no {', '.join(missing)}, which `lerobot-wm quality` needs. Give a dataset of "
-            "`lerobot-wm collect`."
-        )
     dataset = LeRobotDataset(source.repo_id, root=source.root, revision=source.revision)
+    # Where it is not known which episodes begin alike, each counts as a variation of its own.
+    variation = VARIATION if has_positions(meta) else "episode_index"
     table = pd.DataFrame(
         {
-            key: column_tensor(dataset.hf_dataset, key, (1,)).numpy()
-            for key in ("episode_index", "task_index", VARIATION)
+            name: column_tensor(dataset.hf_dataset, key, (1,)).numpy()
+            for name, key in (
+                ("episode_index", "episode_index"),
+                ("task_index", "task_index"),
+                (VARIATION, variation),
+            )
         }
     )
     tasks = [str(task) for task in dataset.meta.tasks.index]
@@ -132,23 +138,54 @@ def read_demonstrations(
     # Each camera's (N, 64, 64, C), by absolute index.
     of_cameras = [camera_frames(dataset, key, (IMAGE_SIZE, IMAGE_SIZE)) for key in cameras]
     columns = {
-        key: column_tensor(dataset.hf_dataset, key, tuple(dataset.meta.features[key]["shape"]))
-        for key in (*NEEDED, "episode_index", "index", "task_index")
+        key: column_tensor(dataset.hf_dataset, key, tuple(feature["shape"]))
+        for key, feature in meta.features.items()
+        if key not in meta.camera_keys and feature["dtype"].startswith(("float", "int", "bool"))
     }
+    # LeRobot drops the axis of vectors of one number.
+    vectors = {
+        key: values.view(len(values), -1)
+        for key, values in columns.items()
+        if key == ACTION or key.startswith("observation.")
+    }
+    joined = join_vectors(vectors, proprio)
     _, lengths = torch.unique_consecutive(columns["episode_index"], return_counts=True)
-    per_episode = {key: column.split(lengths.tolist()) for key, column in columns.items()}
+
+    def split(values: Tensor) -> tuple[Tensor, ...]:
+        return values.split(lengths.tolist())
+
+    per_episode = {key: split(columns[key]) for key in ("index", "task_index", variation)}
+    actions = split(vectors.pop(ACTION))
+    if has_positions(meta):
+        vectors = {name: vectors[OBS_ENV_STATE][:, place] for name, place in POSITIONS.items()}
+    targets = {name: split(values) for name, values in vectors.items()}
+    success = _success(columns, reward_key)
     return [
         Episode(
             task=tasks[int(per_episode["task_index"][i][0])],
-            variation=int(per_episode[VARIATION][i][0]),
+            variation=int(per_episode[variation][i][0]),
             frames=[frames[int(index[0]) : int(index[-1]) + 1] for frames in of_cameras],
-            actions=per_episode[ACTION][i],
-            proprio=per_episode[OBS_STATE][i],
-            env_state=per_episode[OBS_ENV_STATE][i],
-            success=per_episode[SUCCESS][i],
+            actions=actions[i],
+            proprio=None if joined is None else split(joined)[i],
+            targets={name: values[i] for name, values in targets.items()},
+            success=None if success is None else split(success)[i],
         )
         for i, index in enumerate(per_episode["index"])
     ]
+
+
+def has_positions(meta: LeRobotDatasetMetadata) -> bool:
+    """Whether a dataset is of `lerobot-wm collect`: with positions of objects, and fixed variations of them."""
+    shape = meta.features.get(OBS_ENV_STATE, {"shape": ()})["shape"]
+    return tuple(shape) == (ENV_STATE_DIM,) and VARIATION in meta.features
+
+
+def _success(columns: Mapping[str, Tensor], reward_key: str) -> Tensor | None:
+    """Whether each step (N,) succeeded; None where the dataset does not say."""
+    values = columns.get(SUCCESS, columns.get(reward_key))
+    if values is None or not ((values == 0) | (values == 1)).all():
+        return None
+    return values.bool()
 
 
 @torch.no_grad()
@@ -172,9 +209,13 @@ def filter_episodes(world_model: WorldModel, episodes: list[Episode]) -> list[Fi
 def _embed(world_model: WorldModel, episode: Episode, device: torch.device) -> Tensor:
     """e_t of one episode, (T, E)."""
     images = episode.images(slice(None)).to(device)
-    return world_model.embed(images[None], episode.proprio[None].to(device))[0]
+    proprio = None if episode.proprio is None else episode.proprio[None].to(device)
+    return world_model.embed(images[None], proprio)[0]
 
 
 def start_positions(episodes: list[Episode]) -> list[tuple[str, ...]]:
     """Task, object and goal at each episode's first frame: equal to the bit for equal variations."""
-    return [(episode.task, *map(str, episode.env_state[0, _POSITIONS].tolist())) for episode in episodes]
+    return [
+        (episode.task, *(str(x) for name in ("object", "goal") for x in episode.targets[name][0].tolist()))
+        for episode in episodes
+    ]

@@ -19,9 +19,10 @@ _LABELS = {"foreground_psnr": "foreground PSNR (dB)", "psnr": "PSNR (dB)", "ssim
 
 def quality_figures(result: dict[str, Any]) -> dict[str, Figure]:
     """The figures of a quality.json by name."""
+    probes = pd.DataFrame(result["probes"])
     return {
         "open_loop": _open_loop_figure(pd.DataFrame(result["open_loop"])),
-        "probes": _probes_figure(pd.DataFrame(result["probes"])),
+        **({} if probes.empty else {"probes": _probes_figure(probes)}),
         "kl": _kl_figure(result["kl"]),
         "drift": _drift_figure(pd.DataFrame(result["drift"]), result["settings"]["restart"]),
     }
@@ -74,21 +75,27 @@ def _probes_figure(table: pd.DataFrame) -> Figure:
     targets = list(table["target"].unique())
     tasks = list(table["task"].unique())
     figure = Figure(figsize=(9, 0.3 * len(tasks) + 1.3), layout="constrained")
-    panels = figure.subplots(1, len(targets), sharey=True)
+    panels = figure.subplots(1, len(targets), sharey=True, squeeze=False)[0]
+    error, unit = probe_error(table)
     for axes, target in zip(panels, targets, strict=True):
         of_target = table[table["target"] == target]
         for colour, (name, group) in zip(
             _COLOURS, of_target.groupby("representation", sort=False), strict=True
         ):
             rows = [tasks.index(task) for task in group["task"]]
-            axes.scatter(group["median_cm"], rows, s=22, color=colour, label=name)
+            axes.scatter(group[f"median_{error}"], rows, s=22, color=colour, label=name)
         axes.set_xlim(left=0)
-        axes.set_xlabel("median error (cm)", fontsize=8)
+        axes.set_xlabel(f"median error ({unit})", fontsize=8)
         axes.set_yticks(range(len(tasks)), [fill(task, 30) for task in tasks])
         _tidy(axes, target)
     panels[0].invert_yaxis()
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return figure
+
+
+def probe_error(table: pd.DataFrame) -> tuple[str, str]:
+    """How the columns of the probes' errors end, and their unit."""
+    return ("cm", "cm") if "median_cm" in table.columns else ("std", "standard deviations")
 
 
 def _kl_figure(kl: dict[str, Any]) -> Figure:

@@ -147,6 +147,8 @@ def summarise(errors: pd.DataFrame) -> list[dict]:
 def reward_quality(world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered]) -> list[dict]:
     """How well the predicted reward ranks successful steps above others, per task and over all tasks.
 
+    The episodes' `success` is known.
+
     s_t predicts the reward r_{t-1} that arrived with o_t; the label is `next.success` of frame t - 1, so that models of
     any reward can be compared. By chance AUROC is 0.5 and average precision the base rate; both are None where all
     steps succeed or all fail.
@@ -161,6 +163,7 @@ def reward_quality(world_model: WorldModel, episodes: list[Episode], filtered: l
             }
         )
         for episode, loop in zip(episodes, filtered, strict=True)
+        if episode.success is not None
     )
     rows = []
     for task, group in _with_all_tasks(steps).groupby("task", sort=False):

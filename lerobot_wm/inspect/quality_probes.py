@@ -1,5 +1,6 @@
 """Linear probes: what can be read from the latents on variations that the probe was not fitted to."""
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +14,10 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
-from lerobot_wm.inspect.quality_episodes import Episode, Filtered
+from lerobot_wm.inspect.quality_episodes import POSITIONS, Episode, Filtered
 
-# Meta-World's 39-dimensional state (m): hand and first object at its start, the goal at its end.
-TARGETS = {"object": slice(4, 7), "gripper": slice(0, 3), "goal": slice(36, 39)}
+logger = logging.getLogger(__name__)
+
 LATENT, EMBEDDING, UNTRAINED, PIXELS = "latent s_t", "frame-only e_t", "untrained RSSM", "raw-pixel PCA"
 # The probe that does not look at the image: the mean position, the most frequent task.
 BLIND = "no image"
@@ -41,14 +42,14 @@ class Frames:
 
     Attributes:
         features: The representations that are compared, (N, ·) float64 each: float32 loses the smallest penalties.
-        env_state: (N, 39), in m.
+        targets: What is read from them, (N, ·) by name; Meta-World's positions are in m.
         tasks: (N,) task strings.
-        variations: (N,); frames are split by these, never one by one.
+        variations: (N,); frames are split by these, never one by one. Other datasets' episodes count as variations.
         to_fit: (N,) bool, the frames of the training data; None fits by cross-validation.
     """
 
     features: dict[str, np.ndarray]
-    env_state: np.ndarray
+    targets: dict[str, np.ndarray]
     tasks: np.ndarray
     variations: np.ndarray
     to_fit: np.ndarray | None
@@ -104,7 +105,10 @@ def draw_frames(
     }
     return Frames(
         features={name: x.astype(np.float64) for name, x in features.items()},
-        env_state=gather([episode.env_state.numpy() for episode in episodes]),
+        targets={
+            name: gather([episode.targets[name].numpy() for episode in episodes])
+            for name in episodes[0].targets
+        },
         tasks=per_frame([episode.task for episode in episodes]),
         variations=per_frame([episode.variation for episode in episodes]),
         to_fit=to_fit if n_fit else None,
@@ -127,8 +131,8 @@ def splits(frames: Frames, rows: np.ndarray) -> list[Split]:
     needed = 3 if frames.to_fit is None else 2
     if n < needed:
         raise ValueError(
-            f"Probes of '{frames.tasks[rows[0]]}' need {needed} variations to fit, and there are {n}. Use a dataset "
-            "with more variations, or raise --episodes_per_task."
+            f"Probes of '{frames.tasks[rows[0]]}' need {needed} episodes of different variations to fit, and there are "
+            f"{n}. Use a dataset with more, or raise --episodes_per_task."
         )
     if frames.to_fit is not None:
         fit = frames.to_fit[rows]
@@ -154,17 +158,26 @@ def fit_ridge(x: np.ndarray, y: np.ndarray, variations: np.ndarray, *, standardi
 
 
 def probe_positions(frames: Frames) -> list[dict]:
-    """Error of object, gripper and goal position per task and representation, and its mean over tasks.
+    """Error of each target per task and representation, and its mean over tasks.
 
-    There is one probe per task, since the object differs between tasks. `r2` is the share of the held-out
-    positions' variance that is explained, summed over x, y and z; below 0 is worse than their mean.
+    There is one probe per task, since the object differs between tasks; tasks with too few variations are left out. The
+    error of positions is their distance in cm; that of other vectors is the root mean square over their numbers, each
+    in standard deviations. `r2` is the share of the held-out variance that is explained, summed over a target's
+    numbers; below 0 is worse than their mean.
     """
     rows = []
+    in_cm = set(frames.targets) == set(POSITIONS)
+    median, mean = ("median_cm", "mean_cm") if in_cm else ("median_std", "mean_std")
+    targets = frames.targets if in_cm else _standardised(frames.targets)
     for task in tqdm(dict.fromkeys(frames.tasks.tolist()), desc="Probing", unit="task"):
         of_task = np.flatnonzero(frames.tasks == task)
-        divided = splits(frames, of_task)
-        for target, columns in TARGETS.items():
-            truth = frames.env_state[:, columns]  # (N, 3)
+        try:
+            divided = splits(frames, of_task)
+        except ValueError as reason:
+            logger.warning("No probes: %s", reason)
+            continue
+        for target, truth in targets.items():
+            factor = _CM if in_cm else truth.shape[1] ** -0.5
             for name in REPRESENTATIONS:
                 x = frames.features[name]
                 tested, predicted = [], []
@@ -177,28 +190,43 @@ def probe_positions(frames: Frames) -> list[dict]:
                     tested.append(truth[test])
                     predicted.append(probe.predict(x[test]))
                 y, y_hat = np.concatenate(tested), np.concatenate(predicted)
-                error = _CM * np.linalg.norm(y - y_hat, axis=1)
+                error = factor * np.linalg.norm(y - y_hat, axis=1)
                 rows.append(
                     {
                         "task": task,
                         "target": target,
                         "representation": name,
-                        "median_cm": float(np.median(error)),
-                        "mean_cm": float(error.mean()),
+                        median: float(np.median(error)),
+                        mean: float(error.mean()),
                         "r2": float(r2_score(y, y_hat, multioutput="variance_weighted")),
                     }
                 )
+    if not rows:
+        return []
     groups = pd.DataFrame(rows).groupby(["target", "representation"], sort=False, as_index=False)
-    means = groups[["median_cm", "mean_cm", "r2"]].mean().assign(task=MEAN_OF_TASKS)
+    means = groups[[median, mean, "r2"]].mean().assign(task=MEAN_OF_TASKS)
     return rows + means.to_dict("records")
 
 
+def _standardised(targets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Targets (N, ·) with a variance of 1, without numbers that never change."""
+    moving = {name: values[:, values.std(0) > 0] for name, values in targets.items()}
+    return {name: values / values.std(0) for name, values in moving.items() if values.shape[1]}
+
+
 def probe_task(frames: Frames) -> list[dict]:
-    """Share of frames whose task a logistic regression finds, by representation; empty where there is one task."""
+    """Share of frames whose task a logistic regression finds, by representation; empty where there is one task.
+
+    Also empty where there are too few variations.
+    """
     if len(set(frames.tasks)) == 1:
         return []
     rows = []
-    divided = splits(frames, np.arange(len(frames.tasks)))
+    try:
+        divided = splits(frames, np.arange(len(frames.tasks)))
+    except ValueError as reason:
+        logger.warning("No probe of the task: %s", reason)
+        return []
     for name in REPRESENTATIONS:
         x = frames.features[name]
         correct = []

@@ -230,7 +230,8 @@ def _frames(
         for position in range(0, length, _FRAMES_AT_ONCE):
             window = dataset[start + position]
             for step in range(min(_FRAMES_AT_ONCE, length - position)):
-                yield {key: window[key][step] for key in keys} | {TASK: task}
+                # LeRobot drops the axis of vectors of one number.
+                yield {key: torch.atleast_1d(window[key][step]) for key in keys} | {TASK: task}
                 bar.update()
 
     start = 0

@@ -12,11 +12,16 @@ from tqdm import tqdm
 
 from lerobot_wm.constants import TASK
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.inspect.dream import Dreams, dream, strip_figure, write_dream
+from lerobot_wm.inspect.dream import Dreams, actions_are_targets, dream, strip_figure, write_dream
 from lerobot_wm.inspect.episodes import ImaginingPolicy, episodes_by_task, read_episodes
 from lerobot_wm.inspect.open_loop import CONTEXT
 from lerobot_wm.inspect.pictures import MP4, PNG, SVG, data_uri, figure_uri
-from lerobot_wm.inspect.quality_figures import EXAMPLE_HORIZON, EXAMPLES_NAME, quality_figures
+from lerobot_wm.inspect.quality_figures import (
+    EXAMPLE_HORIZON,
+    EXAMPLES_NAME,
+    probe_error,
+    quality_figures,
+)
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.tables import Measurement, ReportTable
 
@@ -65,8 +70,9 @@ def dream_clips(
     if not chosen:
         return []
     episodes = read_episodes(policy, meta, source, chosen, MAX_FRAMES)
+    hold = actions_are_targets(meta)
     return [
-        _clip(dream(policy, episode, CONTEXT), episode[TASK], index, meta.fps)
+        _clip(dream(policy, episode, CONTEXT, hold_action=hold), episode[TASK], index, meta.fps)
         for index, episode in zip(tqdm(chosen, desc="Dreaming", unit="episode"), episodes, strict=True)
     ]
 
@@ -104,7 +110,7 @@ def read_quality(path: Path) -> dict[str, Any]:
                 f"{needed} is missing: --quality takes the quality.json that `lerobot-wm quality` wrote, in its folder."
             )
     result = json.loads(path.read_text())
-    open_loop = pd.DataFrame(result["open_loop"])
+    open_loop, probes = pd.DataFrame(result["open_loop"]), pd.DataFrame(result["probes"])
     return result | {
         "figures": {name: figure_uri(figure, SVG) for name, figure in quality_figures(result).items()},
         "examples": data_uri(examples.read_bytes(), PNG),
@@ -113,7 +119,8 @@ def read_quality(path: Path) -> dict[str, Any]:
         "open_loop_table": _open_loop_table(open_loop),
         "foreground_table": _foreground_table(open_loop),
         "reward_table": _reward_table(result["reward"]) if result["reward"] else None,
-        "probe_tables": _probe_tables(pd.DataFrame(result["probes"])),
+        "probe_tables": [] if probes.empty else _probe_tables(probes),
+        "probe_unit": probe_error(probes)[1],
         "kl_table": _kl_table(result["kl"]["tasks"]),
     }
 
@@ -164,19 +171,25 @@ def _reward_table(tasks: list[dict[str, Any]]) -> ReportTable:
 def _probe_tables(table: pd.DataFrame) -> list[ReportTable]:
     """One table per target: tasks down, representations across."""
     tables = []
+    error, _ = probe_error(table)
+    digits = 1 if error == "cm" else 2
     for target, group in table.groupby("target", sort=False):
         rows = [
             (
                 str(task),
                 [
-                    Measurement(f"{row.median_cm:.1f}", f"{row.mean_cm:.1f} · {row.r2:.2f}")
-                    for row in of_task.itertuples()
+                    Measurement(
+                        f"{row[f'median_{error}']:.{digits}f}",
+                        f"{row[f'mean_{error}']:.{digits}f} · {row['r2']:.2f}",
+                    )
+                    for row in of_task.to_dict("records")
                 ],
             )
             for task, of_task in group.groupby("task", sort=False)
         ]
         columns = list(group["representation"].unique())
-        tables.append(ReportTable(f"Position of the {target}", "task", columns, rows, n_totals=1))
+        title = f"Position of the {target}" if error == "cm" else str(target)
+        tables.append(ReportTable(title, "task", columns, rows, n_totals=1))
     return tables
 
 

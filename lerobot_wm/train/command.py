@@ -17,7 +17,7 @@ from lerobot_wm.encode.dataset import LATENTS_PREFIX, encode_to_cache
 from lerobot_wm.errors import check_can_push
 from lerobot_wm.files import sole_writer
 from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config, read_json
-from lerobot_wm.policies.common.checks import check_fit, names_given_by
+from lerobot_wm.policies.common.checks import check_fit, names_given_by, rename_command
 from lerobot_wm.policies.common.config import PolicyConfig
 from lerobot_wm.policies.latent.config import LatentPolicyConfig
 from lerobot_wm.system import keep_freed_memory
@@ -107,6 +107,13 @@ def check_base_is_kept(policy: PreTrainedConfig) -> None:
 @parser.wrap()
 def train(cfg: TrainPipelineConfig) -> None:
     """Train any LeRobot policy as `lerobot-train` does, from the same flags, into the same checkpoints."""
+    is_new = cfg.policy is not None and cfg.policy.pretrained_path is None and not cfg.resume
+    if cfg.rename_map and is_new and parser.get_path_arg("policy") is None:
+        raise ValueError(
+            "--rename_map gives a dataset the names that a checkpoint was trained with (--policy.path). A new policy "
+            "takes the dataset's own names; to change these, make a copy: "
+            f"{rename_command(cfg.dataset.repo_id, cfg.dataset.root, cfg.rename_map)}"
+        )
     cfg.validate()
     if cfg.policy is None or cfg.dataset.streaming or cfg.job.is_remote:
         raise ValueError(

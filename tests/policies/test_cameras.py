@@ -92,7 +92,7 @@ def test_each_camera_is_reconstructed_and_matters_to_the_latent() -> None:
     [
         ("observation.image", (3, 48, 96), r"image_key is 'observation\.image'.*left, .*right\."),
         (f"{LEFT},{LEFT}", (3, 48, 96), rf"image_key is '{LEFT},{LEFT}'"),
-        (None, (1, 48, 96), r"left': 3, .*right': 1.*--policy\.image_key"),
+        (f"{LEFT},{RIGHT}", (1, 48, 96), r"left': 3, .*right': 1.*--policy\.image_key"),
     ],
 )
 def test_wrong_choices_are_refused(image_key: str | None, right: tuple[int, int, int], message: str) -> None:

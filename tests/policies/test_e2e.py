@@ -47,7 +47,8 @@ def make_config(
 def make_policy(policy_type: str, **options: Any) -> E2EPolicy:
     torch.manual_seed(0)
     policy = get_policy_class(policy_type)(make_config(policy_type, **options))
-    policy.set_scalings(STATS)
+    policy.state_scaling.set_standard(*map(torch.tensor, STATS[STATE].values()))
+    policy.action_scaling.set_range(*map(torch.tensor, STATS["action"].values()))
     return policy
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.configs import NormalizationMode
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.factory import make_dataset
@@ -285,15 +285,6 @@ def test_fixed_weights_give_the_outputs_they_always_gave(policy_type: str, tmp_p
     policy = get_policy_class(policy_type).from_pretrained(tmp_path)
     fill(policy)
     torch.testing.assert_close(output(policy).flatten(), torch.tensor(golden["output"]), atol=2e-4, rtol=1e-3)
-
-
-@pytest.mark.parametrize("policy_type", TRAINED)
-def test_an_action_of_one_number_is_refused(policy_type: str, make: Make) -> None:
-    """LeRobot hands over B of them as (1, B), on which behaviour cloning would learn the batch's mean."""
-    config = deepcopy(make(policy_type)[2].config)
-    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (1,))}
-    with pytest.raises(ValueError, match=r"'action' has the shape \(1,\); expected two numbers or more"):
-        get_policy_class(policy_type)(config)
 
 
 @pytest.mark.parametrize("policy_type", ACTING)

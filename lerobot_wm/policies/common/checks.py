@@ -1,8 +1,11 @@
 """Whether a policy fits the dataset it is trained on or the environment it acts in, checked before work starts."""
 
+import json
+import shlex
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 from types import MappingProxyType
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
@@ -10,8 +13,9 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.utils import STATS_PATH
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
+from lerobot.utils.constants import DEFAULT_FEATURES, OBS_STR
 
-from lerobot_wm.constants import ACTION, OBS_LATENT
+from lerobot_wm.constants import ACTION, OBS_IMAGES, OBS_LATENT, OBS_STATE
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.tasks import resolve_tasks, task_description
 from lerobot_wm.policies.common.config import (
@@ -49,7 +53,9 @@ def check_fit(
         _check_environment(config, other, rename_map)
         return
     config.check_dataset(other)
-    if config.pretrained_path is not None:
+    if config.pretrained_path is None:
+        check_names(other)
+    else:
         check_reads(config, other, rename_map)
 
 
@@ -76,6 +82,37 @@ def check_reads(
     if not reads_latents:
         cameras = [rename_map.get(key, key) for key in dataset_meta.camera_keys]
         check_cameras_present(config, cameras, dataset_meta.repo_id)
+
+
+def check_names(dataset_meta: LeRobotDatasetMetadata) -> None:
+    """Check that a dataset to train a new policy on has an action, and cameras with LeRobot's names.
+
+    LeRobot applies `--rename_map` to checkpoints only.
+
+    Raises:
+        ValueError: It has other names; gives the command that renames them.
+    """
+    features = dataset_meta.features
+    cameras = [key for key in dataset_meta.camera_keys if not key.startswith(f"{OBS_STR}.")]
+    if ACTION in features and not cameras:
+        return
+    names = {key: f"{OBS_IMAGES}.{key}" for key in cameras}
+    names |= {key: ACTION for key in ("actions",) if key in features and ACTION not in features}
+    names |= {key: OBS_STATE for key in ("state",) if key in features and OBS_STATE not in features}
+    raise ValueError(
+        f"{dataset_meta.repo_id} has {', '.join(key for key in features if key not in DEFAULT_FEATURES)}; LeRobot "
+        f"reads cameras named '{OBS_IMAGES}.NAME', '{OBS_STATE}' and '{ACTION}'. Train on a renamed copy: "
+        f"{rename_command(dataset_meta.repo_id, dataset_meta.root, names or {'OLD': ACTION})}"
+    )
+
+
+def rename_command(repo_id: str, root: str | Path | None, names: Mapping[str, str]) -> str:
+    """The command that makes a copy of a dataset with these new names."""
+    place = [] if root is None else [f"--dataset.root={root}"]
+    copy = f"{root or repo_id.rsplit('/')[-1]}_renamed"
+    flags = [f"--dataset.repo_id={repo_id}", *place, f"--rename_map={json.dumps(names)}"]
+    flags += [f"--output_repo_id={repo_id}_renamed", f"--output_root={copy}"]
+    return f"lerobot-wm rename {shlex.join(flags)}"
 
 
 def check_sizes(

@@ -1,5 +1,6 @@
 """The settings that all our policy types share."""
 
+import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
@@ -10,9 +11,11 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.optim import LRSchedulerConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.nn.images import channels_first
 from lerobot_wm.policies.common.optim import FinalDecayConfig, FusedAdamConfig
+
+logger = logging.getLogger(__name__)
 
 # Scaling is part of our models (lerobot_wm.nn.normalize): a policy and the frozen world model inside it are fitted to
 # different statistics, which one processor pipeline cannot hold. LeRobot's normalizers do nothing.
@@ -27,7 +30,10 @@ class PolicyConfig(PreTrainedConfig):
 
     Args:
         image_key: The cameras, separated by commas: observation.images.corner2,observation.images.topview. Their images
-            are stacked in this order. None takes all cameras of the dataset.
+            are stacked in this order. None takes all cameras of the dataset, without depth where there is colour.
+        state_keys: The vectors that are read as proprioception, separated by commas, and joined in this order:
+            observation.state,observation.effort. None takes observation.state where the dataset has it. World models
+            read them with `rssm.use_proprio` only.
         lr: Learning rate of Adam.
         lr_decay_share: Last part of the training steps, over which the learning rate falls linearly to zero. 0, as in
             the paper, keeps it constant. Not for IQL, whose actors follow a cosine.
@@ -44,6 +50,7 @@ class PolicyConfig(PreTrainedConfig):
         default_factory=lambda: dict(IDENTITY_NORMALIZATION)
     )
     image_key: str | None = None
+    state_keys: str | None = None
     lr: float = 3e-4
     lr_decay_share: float = 0.0
     dtype: str | None = None
@@ -118,9 +125,16 @@ class PolicyConfig(PreTrainedConfig):
         return channels, *self.image_size
 
     @property
+    def state_vectors(self) -> list[str]:
+        """Feature keys of the vectors that are joined to the proprioceptive state; may be empty."""
+        if self.state_keys is None:
+            return [OBS_STATE] if OBS_STATE in self.input_features else []
+        return [key.strip() for key in self.state_keys.split(",") if key.strip()]
+
+    @property
     def state_dim(self) -> int:
-        """Size of the proprioceptive state."""
-        return feature_dim(self.input_features, OBS_STATE)
+        """Size of the proprioceptive state; 0 without proprioception."""
+        return sum(feature_dim(self.input_features, key) for key in self.state_vectors)
 
     @property
     def action_dim(self) -> int | None:
@@ -130,11 +144,23 @@ class PolicyConfig(PreTrainedConfig):
     def choose_cameras(self) -> None:
         """Check `image_key`, or take all cameras where it is None; other cameras are removed from the inputs.
 
+        Depth, which has one channel, is left out by default where there are cameras with more.
+
         Raises:
             ValueError: There is no camera, one is unknown or repeated, or their numbers of channels differ.
         """
         known = image_keys(self.input_features)
-        chosen = known if self.image_key is None else [key.strip() for key in self.image_key.split(",")]
+        if self.image_key is None:
+            depth = [key for key in known if self.input_features[key].shape[0] == 1]
+            chosen = [key for key in known if key not in depth] or known
+            if chosen != known:
+                logger.info(
+                    "Cameras: %s. Not read, as they have one channel: %s. --policy.image_key chooses others.",
+                    ", ".join(chosen),
+                    ", ".join(depth),
+                )
+        else:
+            chosen = [key.strip() for key in self.image_key.split(",")]
         if not chosen or not set(chosen) <= set(known) or len(set(chosen)) < len(chosen):
             raise ValueError(
                 f"--policy.image_key is {self.image_key!r}; the dataset has the cameras {', '.join(known) or 'none'}. "
@@ -188,6 +214,11 @@ class PolicyConfig(PreTrainedConfig):
                 f"{saved.image_key or 'none'}, in this order. Leave the flag out, map other cameras to these names "
                 f"with --rename_map, or {train_new(saved)}."
             )
+        if self.state_vectors != saved.state_vectors:
+            raise ValueError(
+                f"--policy.state_keys={self.state_keys}: this {saved.type} was trained on "
+                f"{', '.join(saved.state_vectors) or 'none'}, in this order. Leave the flag out, or {train_new(saved)}."
+            )
         known, found = saved.output_features.get(ACTION), self.output_features.get(ACTION)
         if known is not None and found is not None and tuple(known.shape) != tuple(found.shape):
             raise ValueError(
@@ -239,7 +270,8 @@ class ActingConfig(PolicyConfig):
             action is a target for it, such as a joint's position. The policy still returns the dataset's units. None
             finds these numbers in the dataset (see `data.tables.relative_to_state`), true takes all, false none.
         tasks: Task strings in one-hot order, taken from the dataset when the policy is created.
-        relative_indices: Which numbers of the action these are; filled when the policy is created.
+        relative_indices: Which numbers of the action these are, and of observation.state; filled when the policy is
+            created.
     """
 
     hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
@@ -262,8 +294,30 @@ class ActingConfig(PolicyConfig):
         return feature_dim(self.output_features, ACTION)
 
     def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
-        """Take the tasks."""
+        """Take the tasks; name vectors that are there and not read."""
         self.tasks = task_names(dataset_meta)
+        unread = [
+            key
+            for key, feature in dataset_meta.features.items()
+            if key.startswith("observation.")
+            and feature["dtype"].startswith(("float", "int"))
+            and len(feature["shape"]) == 1
+            and key not in (*self.state_vectors, OBS_ENV_STATE, OBS_LATENT)
+        ]
+        if unread:
+            logger.info(
+                "Not read: %s. --policy.state_keys=%s reads them as proprioception.",
+                ", ".join(unread),
+                ",".join([*self.state_vectors, *unread]),
+            )
+
+    @property
+    def relative_state_indices(self) -> list[int]:
+        """Where the numbers of `relative_indices` are in the proprioceptive state."""
+        vectors = self.state_vectors
+        before = vectors[: vectors.index(OBS_STATE)] if OBS_STATE in vectors else []
+        start = sum(feature_dim(self.input_features, key) for key in before)
+        return [start + index for index in self.relative_indices]
 
 
 _HINTS = {
@@ -323,18 +377,14 @@ def feature_dim(features: dict[str, PolicyFeature], key: str) -> int:
     """Size of the vector feature `key`.
 
     Raises:
-        ValueError: The feature is missing, or is a single number: LeRobot drops its axis, and the batch (1, B) it makes
-            of B numbers cannot be told from one vector of B numbers.
+        ValueError: The feature is missing, or is no vector.
     """
     if key not in features:
         raise ValueError(f"The dataset has no '{key}'; it has {sorted(features)}.")
-    size = features[key].shape[0]
-    if size == 1:
-        raise ValueError(
-            f"'{key}' has the shape (1,); expected two numbers or more, because LeRobot's batches lose the axis of a "
-            "single one. Record it with a second number, which may be constant."
-        )
-    return size
+    shape = tuple(features[key].shape)
+    if len(shape) != 1:
+        raise ValueError(f"'{key}' has the shape {shape}; expected a vector (N,).")
+    return shape[0]
 
 
 def policy_features(dataset_meta: LeRobotDatasetMetadata) -> dict[str, PolicyFeature]:

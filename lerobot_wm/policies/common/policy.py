@@ -2,7 +2,7 @@
 
 import logging
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, NoReturn, Self
@@ -24,12 +24,20 @@ from lerobot_wm.policies.common.card import TrainingData, model_card
 from lerobot_wm.policies.common.checkpoint import WHOLE, CheckpointError, cut_short, not_finite, read_config
 from lerobot_wm.policies.common.checks import (
     check_has_stats,
+    check_names,
     check_sizes,
     current_names,
     dataset_cameras,
     names_before,
 )
-from lerobot_wm.policies.common.config import ActingConfig, PolicyConfig, check_tasks, task_names, train_new
+from lerobot_wm.policies.common.config import (
+    ActingConfig,
+    PolicyConfig,
+    check_tasks,
+    feature_dim,
+    task_names,
+    train_new,
+)
 from lerobot_wm.policies.common.divergence import check_finite, check_finite_weights
 
 logger = logging.getLogger(__name__)
@@ -72,6 +80,7 @@ class BasePolicy(PreTrainedPolicy):
         """
         super().__init__(config)
         if dataset_meta is not None:
+            check_names(dataset_meta)
             check_has_stats(dataset_meta)
             config.fill_from_dataset(dataset_meta)
         config.validate_features()
@@ -108,13 +117,23 @@ class BasePolicy(PreTrainedPolicy):
         Raises:
             DivergenceError: The loss is NaN or infinite.
         """
-        loss, parts = self.compute_loss(batch)
+        loss, parts = self.compute_loss(self._with_axes(batch))
         scalars = {**parts, "loss": loss.detach()}
         # One transfer from the device for all of them.
         numbers = dict(zip(scalars, torch.stack(list(scalars.values())).tolist(), strict=True))
         check_finite(numbers, self.config, batch)
         del numbers["loss"]
         return loss, numbers
+
+    def _with_axes(self, batch: dict[str, Any]) -> dict[str, Any]:
+        """A training batch whose vectors of one number have the axis that LeRobot drops: (B, 1) or (B, T, 1)."""
+        config = self.config
+        restored = {}
+        for key, feature in {**config.input_features, **config.output_features}.items():
+            if tuple(feature.shape) == (1,) and key in batch:
+                deltas = config.action_delta_indices if key == ACTION else config.observation_delta_indices
+                restored[key] = batch[key].reshape(-1, *([] if deltas is None else [len(deltas)]), 1)
+        return batch | restored
 
     @classmethod
     def from_pretrained(
@@ -238,23 +257,24 @@ class ActingPolicy(BasePolicy):
 
     def fit_dataset(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Scale proprioception to unit variance and actions to [-1, 1]; choose what is relative to the state."""
-        self.state_scaling.set_standard(*statistics(stats, OBS_STATE, "mean", "std"))
+        self.state_scaling.set_standard(*joined_statistics(stats, self.config.state_vectors, "mean", "std"))
         self._choose_relative_actions(dataset_meta)
         self.action_scaling.set_range(*self._action_range(stats, dataset_meta))
 
     def _choose_relative_actions(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         config = self.config
-        if config.relative_actions is None:
+        reads_state = OBS_STATE in config.state_vectors
+        size = feature_dim(config.input_features, OBS_STATE) if reads_state else 0
+        config.relative_indices = []
+        if config.relative_actions is None and reads_state:
             config.relative_indices = relative_to_state(dataset_meta, _state_column())
-        elif not config.relative_actions:
-            config.relative_indices = []
-        elif config.state_dim == config.action_dim:
-            config.relative_indices = list(range(config.action_dim))
-        else:
-            raise ValueError(
-                f"--policy.relative_actions=true: the action has {config.action_dim} numbers and the state "
-                f"{config.state_dim}; expected as many. Leave the flag out."
-            )
+        elif config.relative_actions:
+            if size != config.action_dim:
+                raise ValueError(
+                    f"--policy.relative_actions=true: the action has {config.action_dim} numbers and the "
+                    f"'{OBS_STATE}' that the policy reads {size}; expected as many. Leave the flag out."
+                )
+            config.relative_indices = list(range(size))
         if config.relative_indices:
             logger.info(
                 "%d of the action's %d numbers are targets for the state, and are learned relative to it "
@@ -268,7 +288,10 @@ class ActingPolicy(BasePolicy):
         low, high = (value.clone() for value in statistics(stats, ACTION, "min", "max"))  # (A,)
         chosen = self.config.relative_indices
         if chosen:
-            action, state = (frame_values(dataset_meta, key) for key in (ACTION, _state_column()))  # (N, A)
+            action, state = (
+                frame_values(dataset_meta, key).view(-1, self.config.action_dim)
+                for key in (ACTION, _state_column())
+            )  # (N, A)
             relative = action[:, chosen] - state[:, chosen]  # (N, R)
             low[chosen], high[chosen] = relative.amin(0), relative.amax(0)
         return low, high
@@ -285,13 +308,35 @@ class ActingPolicy(BasePolicy):
         chosen = self.config.relative_indices
         if not chosen:
             return action
-        index = torch.tensor(chosen, device=action.device)
-        return action.index_add(-1, index, state[..., index].to(action.dtype), alpha=sign)
+        index, of_state = (
+            torch.tensor(indices, device=action.device)
+            for indices in (chosen, self.config.relative_state_indices)
+        )
+        return action.index_add(-1, index, state[..., of_state].to(action.dtype), alpha=sign)
+
+    def state_at(self, batch: dict[str, Any], t: int | None = None) -> Tensor:
+        """Proprioception of a batch in the dataset's units.
+
+        Args:
+            batch: Frames (B, ...), or windows of them (B, T, ...).
+            t: Which frame of the windows; None where the batch holds frames.
+
+        Returns:
+            (B, P); P is 0 for a policy without proprioception.
+        """
+        frames = {key: batch[key] if t is None else batch[key][:, t] for key in self.config.state_vectors}
+        state = join_vectors(frames, self.config.state_vectors)
+        return self.state_scaling.offset.new_zeros(self.batch_size(batch), 0) if state is None else state
+
+    def batch_size(self, batch: dict[str, Any]) -> int:
+        """B of a batch, in training or at test time."""
+        keys = (*self.config.input_features, ACTION)
+        return next(len(batch[key]) for key in keys if isinstance(batch.get(key), Tensor))
 
     def scaled_actions(self, batch: dict[str, Any]) -> Tensor:
-        """A training batch's actions (B, A) as the heads learn them; a state (B, 2, P) is that at t and t+1."""
-        state = batch[OBS_STATE]
-        return self.scaled(batch[ACTION], state[:, 0] if state.ndim > 2 else state)
+        """A training batch's actions (B, A) as the heads learn them."""
+        has_windows = self.config.observation_delta_indices is not None  # frames t and t+1
+        return self.scaled(batch[ACTION], self.state_at(batch, 0 if has_windows else None))
 
     def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Also learn the dataset's new tasks."""
@@ -361,7 +406,7 @@ class ActingPolicy(BasePolicy):
         """Actions (B, A) with `action_noise`, clipped to the dataset's range; `batch` is that of `select_action`."""
         if self.config.action_noise == 0:
             return action
-        state = batch[OBS_STATE]
+        state = self.state_at(batch)
         noisy = self._action_noise(self.scaled(action, state), batch)  # (B, A)
         return self.unscaled(noisy.clamp(-1, 1), state)
 
@@ -449,6 +494,19 @@ def _digest(batch: dict[str, Any], i: int) -> int:
     for key in sorted(key for key, value in batch.items() if isinstance(value, Tensor) and value.ndim > 1):
         digest = zlib.crc32(batch[key][i].contiguous().cpu().numpy().tobytes(), digest)
     return digest
+
+
+def join_vectors(batch: Mapping[str, Tensor], keys: Sequence[str]) -> Tensor | None:
+    """Vectors (..., N) of a batch side by side in one; None without any."""
+    if not keys:
+        return None
+    return batch[keys[0]] if len(keys) == 1 else torch.cat([batch[key] for key in keys], dim=-1)
+
+
+def joined_statistics(stats: Statistics, keys: Sequence[str], *names: str) -> Iterator[Tensor]:
+    """`statistics` of vectors that are joined by `join_vectors`; empty without any."""
+    for name in names:
+        yield torch.cat([torch.empty(0), *(value for key in keys for value in statistics(stats, key, name))])
 
 
 def statistics(stats: Statistics, key: str, *names: str) -> Iterator[Tensor]:

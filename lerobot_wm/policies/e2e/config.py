@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.policies.common.config import ActingConfig, policy_features
 
 ENCODERS = ("small", "resnet18", "resnet34")
@@ -55,9 +54,9 @@ class E2EConfig(ActingConfig):
         """Choose the cameras and the image size; the inputs are then the cameras and proprioception.
 
         Raises:
-            ValueError: The cameras cannot be used, or there is no proprioception or no action.
+            ValueError: The cameras cannot be used, `state_keys` are not there, or there is no action.
         """
         self.choose_cameras()
         self.encoder_image_size = self.image_size
         _ = self.state_dim, self.action_dim
-        self.remove_inputs(self.input_features.keys() - {*self.cameras, OBS_STATE})
+        self.remove_inputs(self.input_features.keys() - {*self.cameras, *self.state_vectors})

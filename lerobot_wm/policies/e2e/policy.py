@@ -5,7 +5,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder
 from lerobot_wm.nn.images import camera_images, random_crop
 from lerobot_wm.policies.common.policy import ActingPolicy, check_observation
@@ -57,7 +56,8 @@ class E2EPolicy(ActingPolicy):
         """Act on the current image: the policy's mean action, clipped, and `action_noise`.
 
         Args:
-            batch: Each camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings).
+            batch: Each camera (B, C, H, W) in [0, 1], proprioception such as `observation.state` (B, P), `task` (B
+                strings).
             **kwargs: Not used; LeRobot passes options of other policies.
 
         Returns:
@@ -69,6 +69,6 @@ class E2EPolicy(ActingPolicy):
         if self.training:  # no dropout and no random shifts, as LeRobot's policies act
             self.eval()
         check_observation(self.config, batch)
-        state = batch[OBS_STATE]
+        state = self.state_at(batch)
         tasks = self.one_hot_tasks(batch, state.shape[0])
         return self.with_noise(self.act(self.observation(self.images(batch), state, tasks), state), batch)

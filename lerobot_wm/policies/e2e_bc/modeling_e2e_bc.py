@@ -4,7 +4,6 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.e2e.policy import E2EPolicy
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
@@ -45,7 +44,7 @@ class E2EBCPolicy(E2EPolicy):
         Returns:
             The scalar loss, which has no parts.
         """
-        state = batch[OBS_STATE]
+        state = self.state_at(batch)
         tasks = self.one_hot_tasks(batch, state.shape[0])  # (B, N)
         observation = self.observation(self.images(batch), state, tasks)  # (B, O)
         return bc_loss(self.actor(observation), self.scaled_actions(batch)), {}

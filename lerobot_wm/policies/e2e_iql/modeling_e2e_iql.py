@@ -6,7 +6,6 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
-from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.iql import RewardsAndEnds, make_agent
 from lerobot_wm.policies.e2e.policy import E2EPolicy
@@ -61,11 +60,11 @@ class E2EIQLPolicy(E2EPolicy):
         Returns:
             The sum of the losses, and its parts by name.
         """
-        images, states = self.images(batch), batch[OBS_STATE]  # (B, 2, C, H, W), (B, 2, P)
-        tasks = self.one_hot_tasks(batch, states.shape[0])  # (B, N)
-        now = self.observation(images[:, 0], states[:, 0], tasks)  # (B, O)
+        images = self.images(batch)  # (B, 2, C, H, W)
+        tasks = self.one_hot_tasks(batch, len(images))  # (B, N)
+        now = self.observation(images[:, 0], self.state_at(batch, 0), tasks)  # (B, O)
         with torch.no_grad():
-            following = self.observation(images[:, 1], states[:, 1], tasks)  # (B, O)
+            following = self.observation(images[:, 1], self.state_at(batch, 1), tasks)  # (B, O)
         action = self.scaled_actions(batch)  # (B, A)
         return self.agent.loss(now, following, action, *self.rewards_and_ends(batch))
 

@@ -7,7 +7,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
+from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
 from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
 from lerobot_wm.policies.common.checkpoint import CheckpointError, open_checkpoint
 from lerobot_wm.policies.common.config import (
@@ -85,12 +85,16 @@ class LatentPolicyConfig(ActingConfig):
             self.world_model = None
         elif self.world_model is None:
             self._take_world_model()
-        read = {OBS_STATE, *self.cameras, OBS_ENV_STATE if self.use_environment_state else None}
-        state = self.input_features.get(OBS_STATE)
-        if state is None or state.type is not FeatureType.STATE:
-            raise ValueError(f"The dataset has no '{OBS_STATE}'; it has {sorted(self.input_features)}.")
-        self.remove_inputs(self.input_features.keys() - read)
         _ = self.state_dim, self.env_state_dim
+        read = {*self.state_vectors, *self.cameras, OBS_ENV_STATE if self.use_environment_state else None}
+        if self.world_model is not None:
+            read |= set(self.world_model.proprio_vectors)
+        self.remove_inputs(self.input_features.keys() - read)
+        if not self.input_features:
+            raise ValueError(
+                "--policy.use_latent=false, and the dataset has no proprioception for --policy.state_keys: this policy "
+                "would see nothing."
+            )
         model = self.world_model
         if self.save_predicted_video and (model is None or not model.predicts_images):
             raise ValueError(

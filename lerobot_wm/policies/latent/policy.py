@@ -10,13 +10,20 @@ from lerobot.policies.factory import get_policy_class
 from torch import Tensor, nn
 from torchvision.utils import make_grid
 
-from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_STATE
+from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
 from lerobot_wm.data.latents import weights_fingerprint
 from lerobot_wm.nn.images import camera_images, side_by_side
 from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.policies.common.checkpoint import read_config, split_revision
-from lerobot_wm.policies.common.policy import ActingPolicy, Statistics, check_observation, statistics
+from lerobot_wm.policies.common.policy import (
+    ActingPolicy,
+    Statistics,
+    check_observation,
+    join_vectors,
+    statistics,
+)
 from lerobot_wm.policies.latent.config import LatentPolicyConfig, open_world_model
+from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.policies.world_model.policy import WorldModelPolicy
 from lerobot_wm.world_model.interface import LatentModel, LatentState
 
@@ -131,7 +138,7 @@ class LatentPolicy(ActingPolicy):
             return batch[key] if t is None else batch[key][:, t]
 
         return self.observation(
-            frame(OBS_STATE),
+            self.state_at(batch, t),
             tasks,
             frame(OBS_LATENT) if self.config.use_latent else None,
             frame(OBS_ENV_STATE) if self.config.use_environment_state else None,
@@ -150,8 +157,8 @@ class LatentPolicy(ActingPolicy):
         """Filter the new image and act on the state: the policy's mean action, clipped, and `action_noise`.
 
         Args:
-            batch: Each camera (B, C, H, W) in [0, 1], `observation.state` (B, P), `task` (B strings), and
-                `observation.environment_state` (B, F) with `use_environment_state`.
+            batch: Each camera (B, C, H, W) in [0, 1], proprioception such as `observation.state` (B, P), `task` (B
+                strings), and `observation.environment_state` (B, F) with `use_environment_state`.
             **kwargs: Not used; LeRobot passes options of other policies.
 
         Returns:
@@ -163,7 +170,7 @@ class LatentPolicy(ActingPolicy):
         if self.training:  # no dropout, as LeRobot's policies act
             self.eval()
         check_observation(self.config, batch)
-        state = batch[OBS_STATE]
+        state = self.state_at(batch)
         latent = self._filter(batch) if self.config.use_latent else None
         env_state = batch[OBS_ENV_STATE] if self.config.use_environment_state else None
         tasks = self.one_hot_tasks(batch, state.shape[0])
@@ -190,11 +197,16 @@ class LatentPolicy(ActingPolicy):
         if self._prev_action is None or self._prev_action.shape[0] != images.shape[0]:
             self._filter_state = None
             self._prev_action = images.new_zeros(images.shape[0], self.config.action_dim)
+        assert self.config.world_model is not None
+        proprio = join_vectors(batch, self.config.world_model.proprio_vectors)
         # In float32 even under autocast, as the latents that the policy was trained on. (On a GPU, LeRobot's own loops
         # compute float32 products in TF32; ours do not.)
         with torch.autocast(images.device.type, enabled=False):
             states = self.world_model.observe(
-                images[:, None], self._prev_action[:, None], self._filter_state, batch[OBS_STATE][:, None]
+                images[:, None],
+                self._prev_action[:, None],
+                self._filter_state,
+                None if proprio is None else proprio[:, None],
             )
         self._filter_state = states.last()
         if self.config.save_predicted_video:
@@ -238,6 +250,13 @@ def load_encoder(path: str) -> EncoderPolicy:
     name, revision = split_revision(path)
     config = read_config(name, revision)
     return get_policy_class(config.type).from_pretrained(name, config=config, revision=revision)
+
+
+def encoder_config(policy: EncoderPolicy) -> WorldModelConfig:
+    """The configuration of the world model that a policy holds."""
+    config = policy.config.world_model if isinstance(policy, LatentPolicy) else policy.config
+    assert config is not None  # a policy with a world model
+    return config
 
 
 def encoder_fingerprint(model: LatentModel, **further: Any) -> str:

@@ -5,7 +5,6 @@ from typing import Any
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor, nn
 
-from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.config import compiled
 from lerobot_wm.policies.latent.policy import LatentPolicy
@@ -55,7 +54,7 @@ class WMBCPolicy(LatentPolicy):
         Returns:
             The scalar loss, which has no parts.
         """
-        tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
+        tasks = self.one_hot_tasks(batch, self.batch_size(batch))  # (B, N)
         return self.loss(self.observation_at(batch, tasks), self.scaled_actions(batch)), {}
 
     def loss(self, observation: Tensor, action: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ from typing import Any
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
-from lerobot_wm.constants import OBS_STATE
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.config import compiled
 from lerobot_wm.policies.common.iql import RewardsAndEnds, make_agent
@@ -59,7 +58,7 @@ class WMIQLPolicy(LatentPolicy):
         Returns:
             The sum of the losses, and its parts by name.
         """
-        tasks = self.one_hot_tasks(batch, batch[OBS_STATE].shape[0])  # (B, N)
+        tasks = self.one_hot_tasks(batch, self.batch_size(batch))  # (B, N)
         now, following = (self.observation_at(batch, tasks, t) for t in (0, 1))  # (B, O) each
         return self.agent.loss(now, following, self.scaled_actions(batch), *self.rewards_and_ends(batch))
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.constants import ACTION, OBS_STATE, REWARD
+from lerobot_wm.constants import ACTION, REWARD
 from lerobot_wm.data.tables import last_action_predicts_next
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.common.config import feature_dim
@@ -86,7 +86,7 @@ class WMRSSMConfig(WorldModelConfig):
     @property
     def features_read(self) -> list[str]:
         """Cameras, and proprioception where it is modelled."""
-        return [*self.cameras, *([OBS_STATE] if self.rssm.use_proprio else [])]
+        return [*self.cameras, *(self.state_vectors if self.rssm.use_proprio else [])]
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -137,7 +137,7 @@ class WMRSSMConfig(WorldModelConfig):
             "image_channels": self.image_shape[0],
         }
         if self.rssm.use_proprio:
-            sizes["proprio_dim"] = feature_dim(self.input_features, OBS_STATE)
+            sizes["proprio_dim"] = self.state_dim
         for name, size in sizes.items():
             known = getattr(self.rssm, name)
             if known not in (0, size):

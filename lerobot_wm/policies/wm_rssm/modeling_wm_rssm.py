@@ -7,11 +7,11 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import load_stats
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.constants import ACTION
 from lerobot_wm.nn.images import camera_images
 from lerobot_wm.policies.common.config import compiled
 from lerobot_wm.policies.common.iql import FrameColumn
-from lerobot_wm.policies.common.policy import Statistics, statistics
+from lerobot_wm.policies.common.policy import Statistics, join_vectors, joined_statistics, statistics
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.world_model.policy import WorldModelPolicy
 from lerobot_wm.world_model.model import WorldModel
@@ -36,7 +36,9 @@ class WMRSSMPolicy(WorldModelPolicy):
         model, config = self.world_model, self.config
         model.action_scaling.set_range(*statistics(stats, ACTION, "min", "max"))
         if config.rssm.use_proprio:
-            model.proprio_scaling.set_standard(*statistics(stats, OBS_STATE, "mean", "std"))
+            model.proprio_scaling.set_standard(
+                *joined_statistics(stats, config.proprio_vectors, "mean", "std")
+            )
         if config.rssm.standardize_images:
             # By default LeRobot replaces the cameras' statistics in memory with ImageNet's: read the dataset's own.
             own = load_stats(dataset_meta.root) or {}
@@ -70,5 +72,5 @@ class WMRSSMPolicy(WorldModelPolicy):
             actions=batch[ACTION],
             valid=~batch[f"{ACTION}_is_pad"],
             rewards=self.rewards(batch, batch[ACTION].shape[1]) if self._learns_reward else None,
-            proprio=batch[OBS_STATE] if config.rssm.use_proprio else None,
+            proprio=join_vectors(batch, config.proprio_vectors),
         )

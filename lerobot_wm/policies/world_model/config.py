@@ -28,6 +28,11 @@ class WorldModelConfig(PolicyConfig):
     scales_latents: ClassVar[bool] = True
 
     @property
+    def proprio_vectors(self) -> list[str]:
+        """Feature keys of the vectors that the model reads beside the images, as one."""
+        return [key for key in self.state_vectors if key in self.features_read]
+
+    @property
     @abstractmethod
     def latent_dim(self) -> int:
         """Size of s_t; a subclass may make it a field."""
@@ -46,6 +51,7 @@ _NOT_STORED = {item.name for item in fields(WorldModelConfig)} - {
     "input_features",
     "output_features",
     "image_key",
+    "state_keys",
 }
 
 

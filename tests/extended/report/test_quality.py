@@ -7,14 +7,17 @@ from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect import quality
 from lerobot_wm.inspect.episodes import load_world_model
+from lerobot_wm.inspect.open_loop import WINDOW
 from lerobot_wm.report.page import template_environment
 from lerobot_wm.report.world_model import read_quality
+from tests.recording import camera, record, train_flags, vector
 
 
 class Section(HTMLParser):
@@ -97,6 +100,44 @@ def test_fitted_on_the_training_data(
     assert "4 of 4 episodes" in caplog.text
     assert json.loads((tmp_path / "quality.json").read_text())["n_episodes_of_seen_positions"] == 4
     assert "4 of them" in Section(tmp_path / "quality.json").text
+
+
+def test_a_robots_data_needs_no_simulator(tmp_path: Path, lerobot_wm_command: Callable[..., None]) -> None:
+    """One task, a camera of another size, a state, a reward of 0 and 1, no success."""
+    features = {
+        "observation.images.top": camera(48, 64),
+        "observation.state": vector(3),
+        "action": vector(2),
+        "next.reward": vector(1),
+    }
+    dataset = record(
+        tmp_path / "dataset",
+        features,
+        [("Lift", WINDOW + 2)] * 4,
+        lambda t, length: {"next.reward": np.array([t > length - 5], dtype=np.float32)},
+    )
+    lerobot_wm_command(
+        "train --policy.type=wm_rssm --policy.rssm.deter_dim=8 --policy.rssm.stoch_dim=4 --steps=2 --batch_size=2",
+        f"--output_dir={tmp_path / 'wm'} {train_flags(dataset)}",
+    )
+    checkpoint = tmp_path / "wm" / "checkpoints" / "last" / "pretrained_model"
+    lerobot_wm_command(
+        f"quality --world_model_path={checkpoint} --dataset.repo_id=test/recorded --dataset.root={dataset.root}",
+        f"--output_dir={tmp_path / 'out'}",
+    )
+    result = json.loads((tmp_path / "out" / "quality.json").read_text())
+    assert {row["prediction"] for row in result["open_loop"]} >= {
+        "open loop",
+        "copy last frame",
+        "closed loop",
+    }
+    assert {row["target"] for row in result["probes"]} == {"observation.state"}
+    assert all(row["median_std"] > 0 for row in result["probes"])
+    assert result["reward"][0]["auroc"] is not None
+    assert "standard deviations" in Section(tmp_path / "out" / "quality.json").text
+    result["probes"] = []  # as with too few episodes
+    (tmp_path / "out" / "quality.json").write_text(json.dumps(result))
+    assert "linear probe" not in Section(tmp_path / "out" / "quality.json").text
 
 
 @pytest.fixture(scope="module")

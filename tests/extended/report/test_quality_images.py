@@ -85,10 +85,7 @@ def test_open_loop_is_that_of_the_report(world_model_path: Path, episodes: list[
     expected = predict(
         policy,
         one_task[0].task,
-        [
-            {OBS_IMAGE: e.images(window), ACTION: e.actions[window], OBS_STATE: e.proprio[window]}
-            for e in one_task
-        ],
+        [{OBS_IMAGE: e.images(window), ACTION: e.actions[window]} for e in one_task],
     )
     of = {name: table[table["prediction"] == name]["psnr"].tolist() for name in PREDICTIONS}
     assert of["open loop"] == pytest.approx(expected.psnr, abs=1e-3)
@@ -149,10 +146,12 @@ def test_positions_tell_variations_apart(demos_root: Path) -> None:
     assert len(set(start_positions(episodes))) == len(names)
 
 
-def test_a_dataset_without_positions_is_refused(episodes_root: Path) -> None:
-    with pytest.raises(
-        ValueError, match=r"test/episodes.*observation\.environment_state.*lerobot-wm collect"
-    ):
-        read_demonstrations(
-            SourceConfig("test/episodes", str(episodes_root)), [OBS_IMAGE], per_task=1, seed=0
-        )
+def test_a_dataset_without_positions_has_its_vectors_as_targets(episodes_root: Path) -> None:
+    source = SourceConfig("test/episodes", str(episodes_root))
+    episodes = read_demonstrations(source, [OBS_IMAGE], per_task=1, seed=0, proprio=[OBS_STATE])
+    for episode in episodes:
+        assert list(episode.targets) == [OBS_STATE]
+        assert episode.targets[OBS_STATE].shape == episode.actions.shape
+        assert torch.equal(episode.proprio, episode.targets[OBS_STATE])
+        assert episode.success is None
+    assert len({episode.variation for episode in episodes}) == len(episodes)

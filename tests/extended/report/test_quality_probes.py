@@ -9,7 +9,7 @@ import pytest
 from lerobot_wm.constants import OBS_IMAGE
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import load_world_model
-from lerobot_wm.inspect.quality_episodes import filter_episodes, read_demonstrations
+from lerobot_wm.inspect.quality_episodes import POSITIONS, filter_episodes, read_demonstrations
 from lerobot_wm.inspect.quality_probes import (
     BLIND,
     EMBEDDING,
@@ -17,7 +17,6 @@ from lerobot_wm.inspect.quality_probes import (
     LATENT,
     MEAN_OF_TASKS,
     PIXELS,
-    TARGETS,
     UNTRAINED,
     Frames,
     draw_frames,
@@ -36,10 +35,10 @@ def frames() -> Frames:
     n = 2 * VARIATIONS * PER_VARIATION
     tasks = np.repeat(["first", "second"], n // 2)
     variations = np.tile(np.repeat(np.arange(VARIATIONS), PER_VARIATION), 2)
-    env_state = rng.normal(0, 0.1, (n, 39))
+    targets = {name: rng.normal(0, 0.1, (n, 3)) for name in POSITIONS}
     goals = rng.normal(0, 0.1, (2 * VARIATIONS, 3))
-    env_state[:, TARGETS["goal"]] = goals[variations + VARIATIONS * (tasks == "second")]
-    position = np.hstack([env_state[:, columns] for columns in TARGETS.values()])  # (N, 9)
+    targets["goal"] = goals[variations + VARIATIONS * (tasks == "second")]
+    position = np.hstack(list(targets.values()))  # (N, 9)
     is_second = 10.0 * (tasks == "second")[:, None]
     mixture, _ = np.linalg.qr(rng.normal(size=(30, 30)))
     features = {
@@ -51,7 +50,7 @@ def frames() -> Frames:
         ),  # as components: large ones and small ones
         BLIND: np.zeros((n, 1)),
     }
-    return Frames(features, env_state, tasks, variations, to_fit=None)
+    return Frames(features, targets, tasks, variations, to_fit=None)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +64,7 @@ def positions(frames: Frames) -> pd.DataFrame:
 
 def test_a_linear_target_is_recovered_and_noise_is_not(table: pd.DataFrame) -> None:
     # A grid of penalties that began at 10 made latents look half as precise as they are.
-    for target in TARGETS:
+    for target in POSITIONS:
         found, nothing = table.loc[("first", target, LATENT)], table.loc[("first", target, UNTRAINED)]
         blind = table.loc[("first", target, BLIND)]
         assert found["r2"] > 0.95
@@ -87,9 +86,9 @@ def test_knowing_the_variation_by_heart_does_not_help(table: pd.DataFrame) -> No
 
 
 def test_the_blind_probe_is_the_mean_of_what_it_was_fitted_on(frames: Frames) -> None:
-    fitted = Frames(frames.features, frames.env_state, frames.tasks, frames.variations, frames.variations < 5)
+    fitted = Frames(frames.features, frames.targets, frames.tasks, frames.variations, frames.variations < 5)
     of_task = frames.tasks == "second"
-    goal = frames.env_state[:, TARGETS["goal"]]
+    goal = frames.targets["goal"]
     mean = goal[of_task & (frames.variations < 5)].mean(axis=0)
     error = 100 * np.linalg.norm(goal[of_task & (frames.variations >= 5)] - mean, axis=1)
     row = positions(fitted).loc[("second", "goal", BLIND)]
@@ -113,6 +112,17 @@ def test_too_few_variations_are_refused(frames: Frames) -> None:
         splits(frames, rows)
 
 
+def test_other_vectors_are_read_in_standard_deviations(frames: Frames) -> None:
+    goal = 1000 * frames.targets["goal"]
+    targets = {"observation.state": np.hstack([goal, np.ones((len(goal), 1))])}  # one number never changes
+    other = Frames(frames.features, targets, frames.tasks, frames.variations, to_fit=None)
+    table = positions(other)
+    found, blind = (table.loc[("first", "observation.state", name)] for name in (LATENT, BLIND))
+    assert found["r2"] > 0.95
+    assert found["median_std"] < 0.3
+    assert blind["mean_std"] == pytest.approx(1, abs=0.25)
+
+
 def test_the_task_is_found_where_it_is_represented(frames: Frames) -> None:
     accuracy = {row["representation"]: row["accuracy"] for row in probe_task(frames)}
     assert accuracy[LATENT] > 0.99
@@ -124,7 +134,7 @@ def test_one_task_needs_no_probe(frames: Frames) -> None:
     rows = frames.tasks == "first"
     first = Frames(
         {name: x[rows] for name, x in frames.features.items()},
-        frames.env_state[rows],
+        {name: values[rows] for name, values in frames.targets.items()},
         frames.tasks[rows],
         frames.variations[rows],
         to_fit=None,
@@ -140,8 +150,8 @@ def test_frames_of_real_episodes(demos_root: Path, world_model_path: Path) -> No
     filtered = filter_episodes(world_model, episodes)
     frames = draw_frames(episodes, filtered, filtered, n_fit=2, seed=0)
     assert frames.to_fit.tolist() == [i < 2 for i in range(4) for _ in range(FRAMES_PER_EPISODE)]
-    rows = {tuple(row) for row in frames.env_state[:FRAMES_PER_EPISODE].tolist()}
-    assert rows <= {tuple(row) for row in episodes[0].env_state.numpy().astype(np.float64).tolist()}
+    rows = {tuple(row) for row in frames.targets["goal"][:FRAMES_PER_EPISODE].tolist()}
+    assert rows <= {tuple(row) for row in episodes[0].targets["goal"].tolist()}
     assert frames.features[PIXELS].shape == frames.features[LATENT].shape
     # Components keep their proportions: scaled to equal variance, the least of them would drown the first.
     variances = frames.features[PIXELS][frames.to_fit].var(axis=0, ddof=1)

@@ -1,0 +1,124 @@
+"""`lerobot-wm rename`: copy a dataset, with other names for its features.
+
+LeRobot reads `action` and `observation.*`; converters for other libraries write names such as `actions` and `image`.
+Both training commands take the copy.
+"""
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import draccus
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets.io_utils import write_table_one_row_group_per_episode
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import EPISODES_DIR, INFO_PATH, STATS_PATH
+from lerobot.utils.constants import DEFAULT_FEATURES
+from tqdm import tqdm
+
+from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.files import appears_whole, sole_writer
+
+
+@dataclass
+class RenameConfig:
+    """Flags of `lerobot-wm rename`.
+
+    Args:
+        dataset: The dataset to copy.
+        rename_map: New names of features: '{"image": "observation.images.top", "actions": "action"}'.
+        output_repo_id: Repository id of the copy.
+        output_root: Folder of the copy; must not exist yet.
+    """
+
+    dataset: SourceConfig
+    rename_map: dict[str, str]
+    output_repo_id: str
+    output_root: Path
+
+
+def rename(
+    source: LeRobotDataset, rename_map: Mapping[str, str], output_repo_id: str, output_root: Path
+) -> LeRobotDataset:
+    """Write a copy of `source` whose features have other names; nothing else differs.
+
+    Returns:
+        The copy.
+
+    Raises:
+        FileExistsError: `output_root` exists already.
+        BlockingIOError: Another process is writing it.
+        ValueError: There is no such feature, it is one of LeRobot's own, or two would have the same name.
+    """
+    features = list(source.meta.features)
+    if unknown := [key for key in rename_map if key not in features or key in DEFAULT_FEATURES]:
+        raise ValueError(
+            f"--rename_map: {source.repo_id} has no feature {', '.join(unknown)} that can be renamed; it has "
+            f"{', '.join(key for key in features if key not in DEFAULT_FEATURES)}."
+        )
+    names = [rename_map.get(key, key) for key in features]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(
+            f"--rename_map: two features would be named {', '.join(twice)}. Give one another name."
+        )
+    with sole_writer(output_root):
+        if output_root.exists():
+            raise FileExistsError(
+                f"{output_root} already exists: choose another --output_root, or remove it."
+            )
+        with appears_whole(output_root) as temporary:
+            _write(Path(source.root), rename_map, temporary)
+    return LeRobotDataset(output_repo_id, root=output_root)
+
+
+def _write(root: Path, rename_map: Mapping[str, str], folder: Path) -> None:
+    files = [
+        path for name in ("meta", "data", "videos") for path in (root / name).rglob("*") if path.is_file()
+    ]
+    for path in tqdm(files, desc="Copying", unit="file"):
+        place = path.relative_to(root).as_posix()
+        copy = folder / _renamed(place, rename_map)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        if place in (INFO_PATH, STATS_PATH):
+            content = json.loads(path.read_text(encoding="utf-8"))
+            by_name = content["features"] if place == INFO_PATH else content
+            by_name = {_renamed(key, rename_map): value for key, value in by_name.items()}
+            content = {**content, "features": by_name} if place == INFO_PATH else by_name
+            copy.write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
+        elif place.startswith("data/") and path.suffix == ".parquet":
+            write_table_one_row_group_per_episode(_with_names(pq.read_table(path), rename_map), copy)
+        elif place.startswith(f"{EPISODES_DIR}/") and path.suffix == ".parquet":
+            pq.write_table(_with_names(pq.read_table(path), rename_map), copy)
+        else:
+            shutil.copy2(path, copy)
+
+
+def _renamed(name: str, rename_map: Mapping[str, str]) -> str:
+    """The new name of a feature, or of what is named after it: stats/FEATURE/mean, videos/FEATURE/chunk-000."""
+    parts = name.split("/")
+    place = 1 if parts[0] in ("stats", "videos") else 0
+    if len(parts) == 1 or place == 1:
+        parts[place] = rename_map.get(parts[place], parts[place])
+    return "/".join(parts)
+
+
+def _with_names(table: pa.Table, rename_map: Mapping[str, str]) -> pa.Table:
+    metadata = dict(table.schema.metadata or {})
+    metadata.pop(b"pandas", None)  # it repeats the names of columns
+    if b"huggingface" in metadata:  # the types with which `datasets` reads images and lists
+        content = json.loads(metadata[b"huggingface"])
+        types = content["info"]["features"]
+        content["info"]["features"] = {_renamed(key, rename_map): kind for key, kind in types.items()}
+        metadata[b"huggingface"] = json.dumps(content).encode()
+    names = [_renamed(name, rename_map) for name in table.column_names]
+    return table.rename_columns(names).replace_schema_metadata(metadata)
+
+
+def main() -> None:
+    """Entry point of `lerobot-wm rename`."""
+    cfg = draccus.parse(RenameConfig)
+    dataset = rename(cfg.dataset.open(), cfg.rename_map, cfg.output_repo_id, cfg.output_root)
+    print(f"{dataset.num_frames} frames, with {', '.join(cfg.rename_map.values())} -> {cfg.output_root}")
