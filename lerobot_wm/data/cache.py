@@ -1,5 +1,6 @@
 """Camera frames, decoded once at a model's image size into a memory-mapped uint8 file beside the dataset."""
 
+import hashlib
 import logging
 import math
 import os
@@ -29,6 +30,7 @@ logger = logging.getLogger(__name__)
 
 _VIDEO_CHANNELS = 3
 CACHE_VARIABLE = "LEROBOT_WM_CACHE"
+_DIGEST_DIGITS = 8
 
 # Size of the frames that a thread decodes at once, which bounds memory for long episodes of large images.
 _CHUNK_BYTES = 2**25
@@ -40,6 +42,8 @@ _MAX_THREADS = 16
 
 def cache_root(dataset_root: Path) -> Path:
     """The folder for files derived from a dataset: `<root>.cache` beside it, or a folder in $LEROBOT_WM_CACHE.
+
+    The folder there is named by the dataset's folder and a digest of its whole path.
 
     For a snapshot in a cache of the Hub it is `$HF_LEROBOT_HOME/lerobot_wm/OWNER--NAME--COMMIT.cache`: beside the
     snapshot, `hf cache prune` would remove it as a snapshot without a branch.
@@ -53,7 +57,9 @@ def cache_root(dataset_root: Path) -> Path:
     dataset_root = Path(os.path.abspath(dataset_root))
     place = os.environ.get(CACHE_VARIABLE)
     if place:
-        root = Path(place) / dataset_root.name
+        # Many datasets are in a folder of the same name.
+        digest = hashlib.sha256(str(dataset_root.resolve()).encode()).hexdigest()[:_DIGEST_DIGITS]
+        root = Path(place) / f"{dataset_root.name}-{digest}"
     elif is_snapshot(dataset_root):
         repository = dataset_root.parents[1].name.removeprefix("datasets--")
         root = HF_LEROBOT_HOME / "lerobot_wm" / f"{repository}--{dataset_root.name}.cache"
