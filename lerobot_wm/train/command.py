@@ -6,11 +6,14 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from copy import deepcopy
 from pathlib import Path
 
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import FeatureType, PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.logging_utils import MetricsTracker
 
 from lerobot_wm.constants import OBS_LATENT, TRAIN_LOG_NAME
@@ -19,7 +22,7 @@ from lerobot_wm.encode.dataset import LATENTS_PREFIX, encode_to_cache
 from lerobot_wm.errors import check_can_push
 from lerobot_wm.files import sole_writer
 from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config, read_json
-from lerobot_wm.policies.common.checks import check_fit, names_given_by
+from lerobot_wm.policies.common.checks import check_fit, dataset_cameras, names_given_by
 from lerobot_wm.policies.common.config import PolicyConfig, only_episodes
 from lerobot_wm.policies.latent.config import LatentPolicyConfig
 from lerobot_wm.system import keep_freed_memory
@@ -79,6 +82,8 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
     check_fit(policy, meta, cfg.rename_map)
     if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent or OBS_LATENT in meta.features:
         return
+    if policy.pretrained_path is None:
+        check_new_policy(policy, meta, cfg)
     encoder = policy.world_model_path
     if policy.pretrained_path is not None:  # its checkpoint holds the world model
         revision = f"@{policy.pretrained_revision}" if policy.pretrained_revision else ""
@@ -87,6 +92,24 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
         encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device), cfg.rename_map)
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None
+
+
+def check_new_policy(
+    policy: LatentPolicyConfig, meta: LeRobotDatasetMetadata, cfg: TrainPipelineConfig
+) -> None:
+    """Check the settings of a new policy on latents against its world model and its evaluation, as LeRobot makes it.
+
+    Raises:
+        ValueError: They do not fit, which would be found out once the dataset is encoded.
+    """
+    trial, features = deepcopy(policy), dataset_to_policy_features(meta.features)
+    trial.output_features = {key: each for key, each in features.items() if each.type is FeatureType.ACTION}
+    trial.input_features = {key: each for key, each in features.items() if key not in trial.output_features}
+    trial.fill_from_dataset(meta)
+    trial.validate_features()
+    if cfg.env is not None and cfg.env_eval_freq > 0:
+        trial.input_features |= dataset_cameras(trial, meta)
+        check_fit(trial, cfg.env)
 
 
 def check_latents_are_there(cfg: TrainPipelineConfig) -> None:

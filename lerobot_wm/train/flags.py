@@ -40,8 +40,6 @@ def check_flags(cfg: TrainPipelineConfig, given: Collection[str]) -> None:
             raise ValueError(f"--{name}={getattr(cfg, name)}: expected at least {lowest}.")
     if cfg.dataset.episodes == []:
         raise ValueError("--dataset.episodes=[] leaves no data: leave the flag out to train on all episodes.")
-    if not 0 <= cfg.dataset.eval_split < 1:
-        raise ValueError(f"--dataset.eval_split={cfg.dataset.eval_split:g}: expected 0 or more, and below 1.")
     if cfg.dataset.image_transforms.enable:
         raise ValueError(
             "--dataset.image_transforms.enable=true has no effect on frames served from RAM: turn it off, or train "
