@@ -22,9 +22,9 @@ from lerobot_wm.encode.dataset import LATENTS_PREFIX, encode_to_cache
 from lerobot_wm.errors import check_can_push
 from lerobot_wm.files import sole_writer
 from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config, read_json
-from lerobot_wm.policies.common.checks import check_fit, dataset_cameras, names_given_by
+from lerobot_wm.policies.common.checks import check_fit, check_reads, dataset_cameras, names_given_by
 from lerobot_wm.policies.common.config import PolicyConfig, only_episodes
-from lerobot_wm.policies.latent.config import LatentPolicyConfig
+from lerobot_wm.policies.latent.config import LatentPolicyConfig, open_world_model
 from lerobot_wm.system import keep_freed_memory
 from lerobot_wm.train.flags import (
     check_episodes,
@@ -105,6 +105,8 @@ def check_new_policy(
     trial, features = deepcopy(policy), dataset_to_policy_features(meta.features)
     trial.output_features = {key: each for key, each in features.items() if each.type is FeatureType.ACTION}
     trial.input_features = {key: each for key, each in features.items() if key not in trial.output_features}
+    if policy.world_model_path is not None:
+        check_reads(open_world_model(policy.world_model_path), meta)
     trial.fill_from_dataset(meta)
     trial.validate_features()
     if cfg.env is not None and cfg.env_eval_freq > 0:

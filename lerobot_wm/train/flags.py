@@ -94,9 +94,8 @@ def check_compiler(device: str) -> None:
     Raises:
         ValueError: There is none.
     """
-    variable, names = ("CXX", ("g++", "clang++")) if device == "cpu" else ("CC", ("gcc", "clang"))
-    if variable in os.environ:
-        names = (os.environ[variable],)
+    variable, usual = ("CXX", ("g++", "clang++")) if device == "cpu" else ("CC", ("gcc", "clang"))
+    names = [os.environ[variable]] if variable in os.environ else usual
     if not any(map(shutil.which, names)):
         raise ValueError(
             f"--policy.compile_model=true needs a compiler, and there is no {' or '.join(names)} here: install one (on "
