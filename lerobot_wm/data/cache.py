@@ -22,6 +22,7 @@ from tqdm import tqdm
 from lerobot_wm.data.check import FIX, DatasetError, brief
 from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.data.source import is_snapshot
+from lerobot_wm.errors import disk_problem
 from lerobot_wm.files import appears_whole, sole_writer
 from lerobot_wm.nn.images import resize_images
 from lerobot_wm.system import usable_cores
@@ -148,6 +149,8 @@ class CameraCache:
                     self._frames[position : position + len(chunk)] = chunk.permute(0, 2, 3, 1).numpy()
                     position += len(chunk)
         except Exception as error:  # decoders do not document what they raise for damaged files
+            if disk_problem(error) is not None:
+                raise
             raise DatasetError(
                 f"{self._file(episode)}: the images of {self._key} in episode {episode} cannot be decoded "
                 f"({brief(error)}): the file is damaged; {FIX}."

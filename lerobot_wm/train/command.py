@@ -162,9 +162,9 @@ def train(cfg: TrainPipelineConfig) -> None:
         if cfg.policy.push_to_hub and not cfg.resume:
             check_base_is_kept(cfg.policy)
     processes = start_processes(cfg.policy)
-    if cfg.policy.push_to_hub and processes.is_main_process:
-        check_can_push(cfg.policy.repo_id)  # now, not when hours of training are over
-    if processes.is_main_process:
+    if processes.is_main_process:  # now, not when hours of training are over
+        if cfg.policy.push_to_hub or cfg.save_checkpoint_to_hub:
+            check_can_push(cfg.policy.repo_id)
         check_login(cfg)
     with (
         sole_writer(cfg.output_dir) if processes.is_main_process else nullcontext(),

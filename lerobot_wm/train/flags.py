@@ -12,6 +12,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
 from lerobot_wm.policies.common.checkpoint import read_json
+from lerobot_wm.policies.common.config import PolicyConfig
 
 # Flags that decide the optimizer and its schedule.
 _OPTIMIZER_FLAGS = ("optimizer.", "scheduler.", "use_policy_training_preset")
@@ -45,8 +46,12 @@ def check_flags(cfg: TrainPipelineConfig, given: Collection[str]) -> None:
             "--dataset.image_transforms.enable=true has no effect on frames served from RAM: turn it off, or train "
             "with lerobot-train."
         )
-    if getattr(cfg.policy, "compile_model", False):
-        check_compiler(torch.device(cfg.policy.device).type)
+    if isinstance(cfg.policy, PolicyConfig):
+        for name in ("peft", "sample_weighting"):
+            if getattr(cfg, name) is not None:
+                raise ValueError(f"--{name}: {cfg.policy.type} has no use for it. Leave its flags out.")
+        if cfg.policy.compile_model:
+            check_compiler(torch.device(cfg.policy.device).type)
     if cfg.resume:
         _check_resumed_optimizer(cfg, given)
         return
