@@ -1,7 +1,9 @@
 """The `lerobot-wm` command: a table of subcommands, each a module with a `main()`."""
 
 import importlib
+import re
 import sys
+from os.path import expanduser
 
 from lerobot.configs.parser import (
     PLUGIN_DISCOVERY_SUFFIX,
@@ -64,6 +66,13 @@ def load_plugins(arguments: list[str]) -> list[str]:
     return arguments
 
 
+def expand_home(argument: str) -> str:
+    """`--flag=~/path` with the home folder in place of `~`, which shells do not expand after an equals sign."""
+    flag, _, value = argument.partition("=")
+    is_home = re.match(r"~[\w.-]*(/|$)", value) is not None
+    return f"{flag}={expanduser(value)}" if flag.startswith("--") and is_home else argument
+
+
 def main() -> None:
     """Run the subcommand that the command line names first."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
@@ -75,7 +84,7 @@ def main() -> None:
     hide_harmless_messages()
     with exit_with_one_line(f"lerobot-wm {name}"):
         try:
-            arguments = load_plugins(sys.argv[2:])
+            arguments = load_plugins(list(map(expand_home, sys.argv[2:])))
         except PluginLoadError as error:
             sys.exit(f"lerobot-wm {name}: {error}")
         # LeRobot's parsers read sys.argv.

@@ -6,10 +6,11 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from traceback import clear_frames, walk_tb
 
 import httpx
-from huggingface_hub import whoami
+from huggingface_hub import constants, whoami
 from huggingface_hub.errors import (
     EntryNotFoundError,
     HfHubHTTPError,
@@ -21,6 +22,7 @@ from huggingface_hub.errors import (
 )
 
 INTERRUPTED = 130  # exit code after Ctrl-C: 128 plus the signal's number
+_READING = ("GET", "HEAD")  # requests that change nothing on the Hub
 LOGIN = "log in with `hf auth login`, or set HF_TOKEN"
 _OURS = "lerobot_wm"
 # Errors of the disk, which libraries often repeat in their own exceptions -> how to fix them.
@@ -104,7 +106,9 @@ def disk_problem(error: BaseException) -> str | None:
     Libraries repeat the system's message, but not always its error number.
     """
     if isinstance(error, OSError) and error.filename and error.errno in _FILE:
-        return f"{error.filename}: {os.strerror(error.errno)}: {_FILE[error.errno]}"
+        return (
+            f"{error.filename}: {os.strerror(error.errno)}: {_FILE[error.errno]}{_cache_hint(error.filename)}"
+        )
     if _is_ours(error):
         return None
     for number, fix in _DISK.items():
@@ -112,6 +116,26 @@ def disk_problem(error: BaseException) -> str | None:
             return f"{os.strerror(number)}: {fix}"
     cause = error.__cause__ or error.__context__
     return None if cause is None else disk_problem(cause)
+
+
+def _cache_hint(path: str | bytes) -> str:
+    """For a path in a cache that libraries chose: how to choose another one."""
+    for variable, folder in cache_folders().items():
+        if Path(os.fsdecode(path)).is_relative_to(folder):
+            return f" (set {variable} to a folder that can be written)"
+    return ""
+
+
+def cache_folders() -> dict[str, Path]:
+    """The folders that libraries write into without being told to, by the variable that chooses another one."""
+    home = Path(constants.HF_HOME)
+    # As `datasets` and LeRobot choose them; importing these takes seconds.
+    places = {
+        "HF_DATASETS_CACHE": os.environ.get("HF_DATASETS_CACHE") or home / "datasets",
+        "HF_LEROBOT_HOME": os.environ.get("HF_LEROBOT_HOME") or home / "lerobot",
+        "HF_HOME": home,
+    }
+    return {variable: Path(folder).expanduser() for variable, folder in places.items()}
 
 
 def _one_line_for(error: Exception) -> str | None:
@@ -199,11 +223,25 @@ def _hub_problem(error: BaseException) -> str | None:
         case HfHubHTTPError():
             return _hub_answer(error)
         case httpx.TransportError():
-            return (
-                f"lost the connection to {error.request.url.host} ({type(error).__name__}). An unfinished push changes "
-                "nothing on the Hub: run the command again; files that arrived are not sent twice."
-            )
+            return _connection_problem(error)
     return None
+
+
+def _connection_problem(error: httpx.TransportError) -> str:
+    try:
+        request = error.request
+    except RuntimeError:  # it belongs to no request
+        return f"no connection to the Hub ({type(error).__name__}): run the command again."
+    found = f"lost the connection to {request.url.host} ({type(error).__name__}) "
+    if request.method in _READING:
+        return (
+            f"{found}while reading {request.url.path}: check the network and run the command again; files that arrived "
+            "are not downloaded twice. With HF_HUB_OFFLINE=1, files on this machine are used."
+        )
+    return (
+        f"{found}while writing to {request.url.path}: an unfinished push changes nothing on the Hub. Run the command "
+        "again; files that arrived are not sent twice."
+    )
 
 
 def _hub_answer(error: HfHubHTTPError) -> str:
@@ -226,7 +264,8 @@ def _hub_answer(error: HfHubHTTPError) -> str:
             )
     answer = one_line(error.server_message or error)
     if status in (401, 403):
-        return f"the Hub refuses ({status}, {answer}): {LOGIN}, with write access."
+        access = "read" if error.request.method in _READING else "write"
+        return f"the Hub refuses ({status}, {answer}): {LOGIN}, with {access} access to {repo_id}."
     return f"the Hub answered {status} to {error.request.method} {url}: {answer}"
 
 

@@ -5,6 +5,7 @@ import fcntl
 import logging
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -50,6 +51,21 @@ def write_whole(path: Path, text: str) -> None:
     """Write a text file, or replace it at once; its folder is created."""
     with appears_whole(path) as temporary:
         temporary.write_text(text)
+
+
+def check_writable(folder: Path) -> None:
+    """Check that files can be written into a folder, or into the place where it would be made.
+
+    Raises:
+        OSError: They cannot; names the folder that exists.
+    """
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        error.filename = str(existing)
+        raise
 
 
 @contextmanager

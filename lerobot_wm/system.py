@@ -1,6 +1,7 @@
 """The machine: usable cores, the kind of CPU, memory, and the log messages of other libraries."""
 
 import ctypes
+import getpass
 import logging
 import math
 import os
@@ -73,6 +74,36 @@ def keep_freed_memory() -> None:
     # The second setting alone would fix the first at 128 KiB, and cost more than both together save.
     if any(mallopt(_MMAP_THRESHOLD, size) for size in (_KEPT_BYTES, _LARGEST_BEFORE_2_35)):
         mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+def name_user() -> None:
+    """Give a user id without a name, as in `docker run --user`, a name for this process; PyTorch's import needs one."""
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):  # OSError from Python 3.13 on
+        os.environ["USER"] = f"user{os.getuid()}"
+
+
+# What a message about OpenGL says -> how to fix it.
+_OPENGL_FIXES = {
+    "MUJOCO_EGL_DEVICE_ID": "unset MUJOCO_EGL_DEVICE_ID, or set it to the number of a GPU that is there",
+    "invalid literal for int": "unset MUJOCO_EGL_DEVICE_ID, or set it to the number of a GPU that is there",
+    "MUJOCO_GL": "unset MUJOCO_GL, or set it to egl or osmesa",
+}
+_OPENGL_PACKAGES = (
+    "on Debian or Ubuntu run apt-get install -y --no-install-recommends libegl1 libgl1 libopengl0 libgl1-mesa-dri and "
+    "use MUJOCO_GL=egl (the default)"
+)
+
+
+def opengl_fix(reason: str) -> str:
+    """How to fix OpenGL that does not start.
+
+    Args:
+        reason: The message of MuJoCo or PyOpenGL. They name a variable with a wrong value; without a library or a
+            driver they say all kinds of things.
+    """
+    return next((fix for text, fix in _OPENGL_FIXES.items() if text in reason), _OPENGL_PACKAGES)
 
 
 @contextmanager

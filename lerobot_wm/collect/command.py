@@ -25,8 +25,8 @@ from lerobot_wm.collect.merge import merge_datasets
 from lerobot_wm.collect.shards import Shard, ShardRecord, versions, write_shard
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.envs.tasks import expert_name
-from lerobot_wm.errors import check_can_push, errors_as_lines
-from lerobot_wm.files import UNFINISHED, appears_whole, sole_writer
+from lerobot_wm.errors import cache_folders, check_can_push, errors_as_lines
+from lerobot_wm.files import UNFINISHED, appears_whole, check_writable, sole_writer
 from lerobot_wm.system import quiet, silence
 from lerobot_wm.workers import (
     Job,
@@ -66,6 +66,8 @@ def _collect(config: CollectConfig, job: Job | None) -> Path:
         shutil.rmtree(folder, ignore_errors=True)
         print(f"{root} is already complete.")
         return root
+    # Merging reads the shards through this cache.
+    check_writable(cache_folders()["HF_DATASETS_CACHE"])
     shards = plan_shards(config)
     mine = job.select(shards) if job else shards
     folder.mkdir(parents=True, exist_ok=True)

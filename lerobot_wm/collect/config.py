@@ -10,7 +10,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot_wm.collect.shards import SHARD_EPISODES, Shard
 from lerobot_wm.constants import CAMERA_NAME, IMAGE_SIZE, MAX_EPISODE_STEPS, REPORTED_VARIATION_SET
 from lerobot_wm.envs.cameras import parse_cameras
-from lerobot_wm.envs.tasks import resolve_tasks
+from lerobot_wm.envs.tasks import resolve_tasks, tasks_of_one_description
 from lerobot_wm.envs.variations import check_variation_set, parse_variations
 from lerobot_wm.workers import Job
 
@@ -59,7 +59,13 @@ class CollectConfig:
         """Check every field."""
         if self.root is None:
             validate_repo_id(self.repo_id)
-        resolve_tasks(self.tasks)
+        tasks = resolve_tasks(self.tasks)
+        for description, (first, *others) in tasks_of_one_description(tasks).items():
+            kept = ",".join(task for task in tasks if task not in others)
+            raise ValueError(
+                f"{first} and {', '.join(others)} have one description, {description!r}, and would become one task of "
+                f"the dataset. Collect {', '.join(others)} into another dataset, and here --tasks={kept}."
+            )
         parse_variations(self.variations)
         check_variation_set(self.variation_set)
         parse_cameras(self.camera_name)

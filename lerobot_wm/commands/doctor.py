@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from huggingface_hub import constants, get_token
+from huggingface_hub import get_token
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.markup import escape
@@ -19,13 +19,14 @@ from rich.table import Table
 from tqdm import tqdm
 
 from lerobot_wm.constants import ENV_TYPE
-from lerobot_wm.system import cpu_kind, usable_cores
+from lerobot_wm.errors import cache_folders
+from lerobot_wm.files import check_writable
+from lerobot_wm.system import cpu_kind, opengl_fix, usable_cores
 
 DISTRIBUTION = "lerobot_policy_wm"
 MAIN_PACKAGES = ("lerobot", "torch", "metaworld", "mujoco")
 # Packages of mujoco 4.x that install into the same mujoco/ folder and remain after a downgrade.
 MUJOCO_LEFTOVERS = ("mujoco-core", "mujoco-studio")
-GL_PACKAGES = "libegl1 libopengl0 libgl1-mesa-dri"
 POLICY_TYPES = ("wm_rssm", "frozen_backbone", "wm_bc", "wm_iql", "e2e_bc", "e2e_iql")
 # Outputs of a full-size run: dataset, frame cache, latents, checkpoints and videos.
 MIN_FREE_GB = 5.0
@@ -146,8 +147,8 @@ def check_rendering() -> Check:
     name = backend or "default"
     if run.returncode == 0:
         return Check("rendering", f"MUJOCO_GL={name} draws a frame")
-    fix = f"MUJOCO_GL=egl and, on Debian: apt-get install -y --no-install-recommends {GL_PACKAGES}"
-    return Check("rendering", f"MUJOCO_GL={name} fails: {last_words(run)}", fix)
+    reason = last_words(run)
+    return Check("rendering", f"MUJOCO_GL={name} fails: {reason}", opengl_fix(reason))
 
 
 def check_discovery() -> Check:
@@ -188,16 +189,33 @@ def check_gpu() -> Check:
 
 
 def check_disk(name: str, folder: Path) -> Check:
-    """Check the free space for outputs.
+    """Check that outputs can be written, and that there is room for them.
 
     Args:
         name: Name of the check.
         folder: A folder, which need not exist yet.
     """
     existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if (unwritable := check_cache(name, folder)).is_broken:
+        return unwritable
     free = shutil.disk_usage(existing).free / 1e9
     fix = "" if free >= MIN_FREE_GB else f"free {MIN_FREE_GB:.0f} GB there, or work on another disk"
     return Check(name, f"{free:.1f} GB free at {folder}", fix)
+
+
+def check_cache(name: str, folder: Path) -> Check:
+    """Check that files can be written into a folder.
+
+    Args:
+        name: Name of the check, and the variable that chooses another folder where there is one.
+        folder: A folder, which need not exist yet.
+    """
+    try:
+        check_writable(folder)
+    except OSError as error:
+        fix = f"make {error.filename} writable, or choose another folder"
+        return Check(name, f"{folder}: {error.strerror}", fix)
+    return Check(name, f"{folder} can be written")
 
 
 def check_hub() -> Check:
@@ -208,13 +226,17 @@ def check_hub() -> Check:
 
 def diagnose() -> list[Check]:
     """Run all checks, in the order in which problems should be fixed."""
+    folders = cache_folders()
+    if place := os.environ.get("LEROBOT_WM_CACHE"):
+        folders["LEROBOT_WM_CACHE"] = Path(place)
     single: list[Callable[[], Check]] = [check_rendering, check_discovery, check_cpu, check_gpu, check_hub]
     return [
         check_python(),
         *check_packages(installed_versions()),
         *[check() for check in tqdm(single, desc="Checking", unit="check", leave=False)],
         check_disk("disk, this folder", Path.cwd()),
-        check_disk("disk, HF_HOME", Path(constants.HF_HOME)),
+        *[check_disk(f"disk, {variable}", folder) for variable, folder in folders.items()],
+        check_cache("home folder", Path.home()),
     ]
 
 

@@ -1,5 +1,6 @@
 """Camera frames, decoded once at a model's image size into a memory-mapped uint8 file beside the dataset."""
 
+import hashlib
 import logging
 import os
 import shutil
@@ -20,6 +21,7 @@ from tqdm import tqdm
 from lerobot_wm.data.check import FIX, DatasetError, brief
 from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.data.source import is_snapshot
+from lerobot_wm.errors import disk_problem
 from lerobot_wm.files import appears_whole, sole_writer
 from lerobot_wm.nn.images import channels_first, resize_images
 from lerobot_wm.system import usable_cores
@@ -28,6 +30,7 @@ logger = logging.getLogger(__name__)
 
 _VIDEO_CHANNELS = 3
 CACHE_VARIABLE = "LEROBOT_WM_CACHE"
+_DIGEST_DIGITS = 8
 
 # PNG images that a thread reads at once.
 _READ_AT_ONCE = 16
@@ -36,6 +39,8 @@ _MAX_THREADS = 16
 
 def cache_root(dataset_root: Path) -> Path:
     """The folder for files derived from a dataset: `<root>.cache` beside it, or a folder in $LEROBOT_WM_CACHE.
+
+    The folder there is named by the dataset's folder and a digest of its whole path.
 
     For a snapshot in a cache of the Hub it is `$HF_LEROBOT_HOME/lerobot_wm/OWNER--NAME--COMMIT.cache`: beside the
     snapshot, `hf cache prune` would remove it as a snapshot without a branch.
@@ -49,7 +54,9 @@ def cache_root(dataset_root: Path) -> Path:
     dataset_root = Path(os.path.abspath(dataset_root))
     place = os.environ.get(CACHE_VARIABLE)
     if place:
-        root = Path(place) / dataset_root.name
+        # Many datasets are in a folder of the same name.
+        digest = hashlib.sha256(str(dataset_root.resolve()).encode()).hexdigest()[:_DIGEST_DIGITS]
+        root = Path(place) / f"{dataset_root.name}-{digest}"
     elif is_snapshot(dataset_root):
         repository = dataset_root.parents[1].name.removeprefix("datasets--")
         root = HF_LEROBOT_HOME / "lerobot_wm" / f"{repository}--{dataset_root.name}.cache"
@@ -140,6 +147,8 @@ class CameraCache:
                 self._frames[position] = image.permute(1, 2, 0).numpy()
                 position += 1
         except Exception as error:  # decoders do not document what they raise for damaged files
+            if disk_problem(error) is not None:
+                raise
             raise DatasetError(
                 f"{self._file(episode)}: the images of {self._key} in episode {episode} cannot be decoded "
                 f"({brief(error)}): the file is damaged; {FIX}."

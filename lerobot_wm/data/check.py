@@ -17,6 +17,8 @@ from lerobot.datasets.io_utils import load_episodes, load_info, load_stats, load
 from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR, INFO_PATH, STATS_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 
+from lerobot_wm.errors import disk_problem
+
 FIX = "copy or download the dataset again"
 RECOMPUTE = (
     f"{FIX}, or train on a copy that `lerobot-edit-dataset --operation.type=recompute_stats` makes, with "
@@ -48,6 +50,8 @@ def read_file[T](path: Path, read: Callable[[Path], T]) -> T:
     try:
         return read(path)
     except Exception as error:  # readers do not document what they raise for damaged files
+        if disk_problem(error) is not None:  # such as a cache that cannot be written
+            raise
         raise DatasetError(
             f"{path} cannot be read ({brief(error.__cause__ or error)}): it is incomplete or damaged; {FIX}."
         ) from error

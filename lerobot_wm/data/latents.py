@@ -102,8 +102,9 @@ class LatentRecord:
         path = root / RECORD_PATH
         if not path.is_file():
             raise ValueError(
-                f"{path} is missing, which names the world model of these latents: encode the dataset again with "
-                "`lerobot-wm encode`."
+                f"{path} is missing, which names the world model of these latents; lerobot-edit-dataset does not copy "
+                "it. Merge, split or edit the datasets of images instead, and encode the result with `lerobot-wm "
+                "encode`."
             )
         try:
             return cls(**json.loads(path.read_text(encoding="utf-8")))

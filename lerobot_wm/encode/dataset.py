@@ -8,11 +8,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_tools import modify_features
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import EPISODES_DIR
 
 from lerobot_wm.constants import OBS_LATENT
 from lerobot_wm.data.cache import cache_root
@@ -78,12 +80,25 @@ def encode(
             encoded = modify_features(
                 source, {OBS_LATENT: (latents, feature)}, source.meta.camera_keys, temporary, output_repo_id
             )
+        _remove_cameras_from_episodes(temporary, source.meta.camera_keys)
         # `modify_features` computes no statistics of new features.
         stats = get_feature_stats(latents, axis=0, keepdims=False)
         write_stats({**encoded.meta.stats, OBS_LATENT: stats}, temporary)
         record.write(temporary)
     shutil.rmtree(latent_batches.folder)
     return LeRobotDataset(output_repo_id, root=output_root)
+
+
+def _remove_cameras_from_episodes(root: Path, cameras: list[str]) -> None:
+    """Remove the columns of cameras from a dataset's table of episodes, where `modify_features` leaves them.
+
+    LeRobot's tools take a dataset with these columns for one that has the videos.
+    """
+    prefixes = tuple(f"{kind}/{camera}/" for kind in ("videos", "stats") for camera in cameras)
+    for path in sorted((root / EPISODES_DIR).glob("*/*.parquet")):
+        table = pq.read_table(path)
+        kept = [name for name in table.column_names if not name.startswith(prefixes)]
+        pq.write_table(table.select(kept), path)
 
 
 def encode_job(

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lerobot_wm.envs.cameras import HAND_CAMERAS, HAND_VIEW_CENTER, UPSIDE_DOWN
+from lerobot_wm.system import opengl_fix
 
 
 def simplify_robot(model: Any, cell: float) -> None:
@@ -75,16 +76,18 @@ if sys.platform == "linux":
     # Even with a display, which may be on another machine, where GLFW draws nothing. MuJoCo reads it when imported.
     os.environ.setdefault("MUJOCO_GL", "egl")
 
-GL_HELP = (
-    "No headless OpenGL (MUJOCO_GL={backend}). On Debian or Ubuntu run\n"
-    "    apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri\n"
-    "and use MUJOCO_GL=egl (the default)."
-)
+
+def _no_opengl(error: Exception) -> RuntimeError:
+    """The error for OpenGL that does not start: the reason that was found, and how to fix it."""
+    backend = os.environ.get("MUJOCO_GL") or "unset"
+    return RuntimeError(f"No headless OpenGL (MUJOCO_GL={backend}; {error}): {opengl_fix(str(error))}.")
+
+
 try:
     # Loads the backend of MUJOCO_GL; without libEGL, PyOpenGL raises an AttributeError.
     import mujoco
 except (AttributeError, RuntimeError, OSError) as error:
-    raise RuntimeError(GL_HELP.format(backend=os.environ.get("MUJOCO_GL"))) from error
+    raise _no_opengl(error) from error
 
 # Largest number of geoms in a scene; Meta-World's have up to about 100.
 MAX_GEOMS = 1000
@@ -186,7 +189,7 @@ def _ensure_gl_context() -> None:
     """Create the process's OpenGL context.
 
     Raises:
-        RuntimeError: There is no working headless OpenGL; names the packages to install.
+        RuntimeError: There is no working headless OpenGL; says why, and how to fix it.
     """
     global _gl_context
     if _gl_context is not None:
@@ -197,9 +200,10 @@ def _ensure_gl_context() -> None:
         # The size is unused in offscreen rendering.
         context = importlib.import_module(module).GLContext(1, 1)
         context.make_current()
-    except (ImportError, AttributeError, RuntimeError, OSError) as error:
-        # PyOpenGL reports a missing library as an AttributeError on None.
-        raise RuntimeError(GL_HELP.format(backend=backend or "unset")) from error
+    except (ImportError, AttributeError, RuntimeError, OSError, ValueError) as error:
+        # PyOpenGL reports a missing library as an AttributeError on None, MuJoCo a device that is no number as a
+        # ValueError.
+        raise _no_opengl(error) from error
     _gl_context = context
     # Runs before the display is terminated; otherwise OpenGL prints errors at exit.
     atexit.register(_free_gl)

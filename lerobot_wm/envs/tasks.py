@@ -60,6 +60,14 @@ def task_description(task: str) -> str:
     return _tables()["TASK_DESCRIPTIONS"][task]
 
 
+def tasks_of_one_description(tasks: Iterable[str]) -> dict[str, list[str]]:
+    """Descriptions that several of these tasks share, each with its tasks: a policy cannot tell them apart."""
+    by_description: dict[str, list[str]] = {}
+    for task in tasks:
+        by_description.setdefault(task_description(task), []).append(task)
+    return {description: sharing for description, sharing in by_description.items() if len(sharing) > 1}
+
+
 def task_id(task: str) -> int:
     """LeRobot's index of a task, 0 to 49."""
     return _tables()["TASK_NAME_TO_ID"][task]

@@ -65,7 +65,7 @@ def dream_clips(
     """
     by_task = episodes_by_task(meta, min_length=CONTEXT + 1)
     if isinstance(policy, LatentPolicy):
-        by_task = {task: episodes for task, episodes in by_task.items() if task in policy.config.tasks}
+        by_task = {task: episodes for task, episodes in by_task.items() if task in policy.config.known_tasks}
     chosen = sorted(episodes[-1] for episodes in list(by_task.values())[:MAX_DREAMS])
     if not chosen:
         return []

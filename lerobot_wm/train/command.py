@@ -2,13 +2,18 @@
 
 import json
 import logging
+import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from copy import deepcopy
 from pathlib import Path
 
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import FeatureType, PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.logging_utils import MetricsTracker
 
 from lerobot_wm.constants import OBS_LATENT, TRAIN_LOG_NAME
@@ -17,23 +22,44 @@ from lerobot_wm.encode.dataset import LATENTS_PREFIX, encode_to_cache
 from lerobot_wm.errors import check_can_push
 from lerobot_wm.files import sole_writer
 from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config, read_json
-from lerobot_wm.policies.common.checks import check_fit, names_given_by, rename_command
-from lerobot_wm.policies.common.config import PolicyConfig
-from lerobot_wm.policies.latent.config import LatentPolicyConfig
+from lerobot_wm.policies.common.checks import (
+    check_fit,
+    check_reads,
+    dataset_cameras,
+    names_given_by,
+    rename_command,
+)
+from lerobot_wm.policies.common.config import PolicyConfig, only_episodes
+from lerobot_wm.policies.latent.config import LatentPolicyConfig, open_world_model
 from lerobot_wm.system import keep_freed_memory
-from lerobot_wm.train.resume import clear_unfinished, explain_how_to_resume, restore_last
+from lerobot_wm.train.flags import (
+    check_episodes,
+    check_flags,
+    check_login,
+    flag_names,
+    write_beside_checkpoint,
+)
+from lerobot_wm.train.resume import clear_unfinished, explain_how_to_resume, restore_last, settings_in
 from lerobot_wm.train.seam import start_processes, train_from_memory
+
+# What LeRobot logs every `--eval_steps` steps.
+_EVAL_LOSS = re.compile(r"step (\d+): eval_loss=(\S+)")
 
 
 @contextmanager
 def train_log(output_dir: Path) -> Iterator[None]:
-    """Write the metrics LeRobot logs to `<output_dir>/train_log.jsonl`, one line per log step."""
+    """Write what LeRobot logs to `<output_dir>/train_log.jsonl`, a line per log step and a line per held-out loss."""
 
     def note(record: logging.LogRecord) -> bool:
+        line: dict[str, float] | None = None
         if isinstance(record.msg, MetricsTracker):
+            line = {"step": record.msg.steps, **record.msg.to_dict()}
+        elif found := _EVAL_LOSS.fullmatch(record.getMessage()):
+            line = {"step": int(found[1]), "eval_loss": float(found[2])}
+        if line is not None:
             output_dir.mkdir(parents=True, exist_ok=True)
             with (output_dir / TRAIN_LOG_NAME).open("a") as file:
-                file.write(json.dumps({"step": record.msg.steps, **record.msg.to_dict()}) + "\n")
+                file.write(json.dumps(line) + "\n")
         return True
 
     # A filter: LeRobot's `init_logging` replaces the root logger's handlers.
@@ -57,11 +83,14 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
     policy = cfg.policy
     where = (cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     meta = open_dataset(*where, cfg.dataset.episodes)
+    check_episodes(cfg, meta)
     if not isinstance(policy, PolicyConfig):
         return
     check_fit(policy, meta, cfg.rename_map)
     if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent or OBS_LATENT in meta.features:
         return
+    if policy.pretrained_path is None:
+        check_new_policy(policy, meta, cfg)
     encoder = policy.world_model_path
     if policy.pretrained_path is not None:  # its checkpoint holds the world model
         revision = f"@{policy.pretrained_revision}" if policy.pretrained_revision else ""
@@ -71,6 +100,26 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
         encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device), cfg.rename_map)
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None
+
+
+def check_new_policy(
+    policy: LatentPolicyConfig, meta: LeRobotDatasetMetadata, cfg: TrainPipelineConfig
+) -> None:
+    """Check the settings of a new policy on latents against its world model and its evaluation, as LeRobot makes it.
+
+    Raises:
+        ValueError: They do not fit, which would be found out once the dataset is encoded.
+    """
+    trial, features = deepcopy(policy), dataset_to_policy_features(meta.features)
+    trial.output_features = {key: each for key, each in features.items() if each.type is FeatureType.ACTION}
+    trial.input_features = {key: each for key, each in features.items() if key not in trial.output_features}
+    if policy.world_model_path is not None:
+        check_reads(open_world_model(policy.world_model_path), meta)
+    trial.fill_from_dataset(meta)
+    trial.validate_features()
+    if cfg.env is not None and cfg.env_eval_freq > 0:
+        trial.input_features |= dataset_cameras(trial, meta)
+        check_fit(trial, cfg.env)
 
 
 def check_latents_are_there(cfg: TrainPipelineConfig) -> None:
@@ -115,18 +164,23 @@ def train(cfg: TrainPipelineConfig) -> None:
             f"{rename_command(cfg.dataset.repo_id, cfg.dataset.root, cfg.rename_map)}"
         )
     cfg.validate()
+    given = flag_names(sys.argv[1:])
     if cfg.policy is None or cfg.dataset.streaming or cfg.job.is_remote:
         raise ValueError(
             "lerobot-wm train trains a policy on this machine, on a dataset that it reads into memory. For reward "
             "models, --dataset.streaming=true and --job.target use lerobot-train."
         )
+    check_flags(cfg, given)
+    write_beside_checkpoint(cfg, given)
     if cfg.policy.pretrained_path is not None:
         open_checkpoint(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
         if cfg.policy.push_to_hub and not cfg.resume:
             check_base_is_kept(cfg.policy)
     processes = start_processes(cfg.policy)
-    if cfg.policy.push_to_hub and processes.is_main_process:
-        check_can_push(cfg.policy.repo_id)  # now, not when hours of training are over
+    if processes.is_main_process:  # now, not when hours of training are over
+        if cfg.policy.push_to_hub or cfg.save_checkpoint_to_hub:
+            check_can_push(cfg.policy.repo_id)
+        check_login(cfg)
     with (
         sole_writer(cfg.output_dir) if processes.is_main_process else nullcontext(),
         explain_how_to_resume(cfg.output_dir),
@@ -142,6 +196,7 @@ def train(cfg: TrainPipelineConfig) -> None:
             train_log(cfg.output_dir),
             damaged_tables_named(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision),
             names_given_by(cfg.rename_map),
+            only_episodes(cfg.dataset.episodes),
         ):
             train_from_memory(cfg)
 
@@ -150,9 +205,13 @@ def main() -> None:
     """Entry point of `lerobot-wm train`."""
     config_path = parser.parse_arg("config_path")
     if config_path is not None:
-        restore_last(Path(config_path))
-        if Path(config_path).is_file():
-            read_json(Path(config_path))
+        settings = settings_in(Path(config_path))
+        restore_last(settings)
+        if settings.is_file():
+            read_json(settings)
+            # LeRobot's parser reads sys.argv.
+            others = parser.filter_arg("config_path", sys.argv[1:])
+            sys.argv = [sys.argv[0], f"--config_path={settings}", *others]
     path = parser.get_path_arg("policy")
     if path:  # before LeRobot's parser reads it, which would show a traceback
         open_checkpoint(path, parser.parse_arg("policy.pretrained_revision"))

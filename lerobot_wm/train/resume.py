@@ -28,6 +28,21 @@ from lerobot_wm.errors import disk_problem
 logger = logging.getLogger(__name__)
 
 
+def settings_in(config_path: Path) -> Path:
+    """The `train_config.json` of a run's folder, of its `checkpoints`, or of one of these; other paths as they are."""
+    if not config_path.is_dir():
+        return config_path
+    place = config_path
+    if (place / CHECKPOINTS_DIR).is_dir():
+        place /= CHECKPOINTS_DIR
+    if place.name == CHECKPOINTS_DIR:
+        place /= LAST_CHECKPOINT_LINK
+    # The link may have to be restored first.
+    if place.name == LAST_CHECKPOINT_LINK or (place / PRETRAINED_MODEL_DIR).is_dir():
+        place /= PRETRAINED_MODEL_DIR
+    return place / TRAIN_CONFIG_NAME
+
+
 def restore_last(config_path: Path) -> None:
     """Set `checkpoints/last` again where a kill fell between its removal and its setting.
 
@@ -45,8 +60,9 @@ def restore_last(config_path: Path) -> None:
         logger.warning("%s was missing, as a kill can leave it. It is %s now.", link, checkpoint.name)
     if config_path.name == TRAIN_CONFIG_NAME and not config_path.is_file():
         raise FileNotFoundError(
-            f"{config_path} not found. A run that stopped before its first checkpoint cannot be resumed: remove its "
-            "folder and start it again without --resume."
+            f"{config_path} not found. --config_path takes the folder of a run, one of its checkpoints, or a "
+            f"{TRAIN_CONFIG_NAME}. A run that stopped before its first checkpoint cannot be resumed: remove its folder "
+            "and start it again without --resume."
         )
 
 

@@ -38,7 +38,7 @@ def eval_command(config: PolicyConfig, repo_id: str) -> str:
         config: The policy's configuration.
         repo_id: Where it is published.
     """
-    tasks = _metaworld_tasks(getattr(config, "tasks", []))
+    tasks = _metaworld_tasks(getattr(config, "known_tasks", []))
     images = [key for key, feature in config.input_features.items() if feature.type is FeatureType.VISUAL]
     # The key of a single camera does not say which one it is: the environment uses its default.
     cameras = [key.removeprefix(f"{OBS_IMAGES}.") for key in images if key != OBS_IMAGE]

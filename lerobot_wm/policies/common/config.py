@@ -1,7 +1,9 @@
 """The settings that all our policy types share."""
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
@@ -270,6 +272,7 @@ class ActingConfig(PolicyConfig):
             action is a target for it, such as a joint's position. The policy still returns the dataset's units. None
             finds these numbers in the dataset (see `data.tables.relative_to_state`), true takes all, false none.
         tasks: Task strings in one-hot order, taken from the dataset when the policy is created.
+        trained_tasks: Those of them that the training episodes had; empty in older checkpoints, for all.
         relative_indices: Which numbers of the action these are, and of observation.state; filled when the policy is
             created.
     """
@@ -279,6 +282,7 @@ class ActingConfig(PolicyConfig):
     action_noise: float = 0.0
     relative_actions: bool | None = None
     tasks: list[str] = field(default_factory=list)
+    trained_tasks: list[str] = field(default_factory=list)
     relative_indices: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -293,9 +297,14 @@ class ActingConfig(PolicyConfig):
         """Size of the action."""
         return feature_dim(self.output_features, ACTION)
 
+    @property
+    def known_tasks(self) -> list[str]:
+        """The tasks that the policy was trained on."""
+        return self.trained_tasks or self.tasks
+
     def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Take the tasks; name vectors that are there and not read."""
-        self.tasks = task_names(dataset_meta)
+        self.tasks, self.trained_tasks = task_names(dataset_meta), tasks_to_learn(dataset_meta)
         unread = [
             key
             for key, feature in dataset_meta.features.items()
@@ -360,17 +369,40 @@ def check_tasks(config: Any, names: Iterable[str]) -> None:
     Raises:
         ValueError: A task is unknown; names it and the known ones.
     """
-    unknown = set(names) - set(config.tasks)
+    unknown = set(names) - set(config.known_tasks)
     if unknown:
         raise ValueError(
-            f"Unknown task {sorted(unknown)}; this policy was trained on {config.tasks}. Use one of these strings, or "
-            "continue training with --policy.path on a dataset that has the new task."
+            f"Unknown task {sorted(unknown)}; this policy was trained on {config.known_tasks}. Use one of these "
+            "strings, or continue training with --policy.path on a dataset that has the new task."
         )
 
 
 def task_names(dataset_meta: LeRobotDatasetMetadata) -> list[str]:
     """The task strings of a dataset, in order of task_index."""
     return [str(task) for task in dataset_meta.tasks.index]
+
+
+_EPISODES: ContextVar[Collection[int] | None] = ContextVar("episodes", default=None)
+
+
+@contextmanager
+def only_episodes(episodes: Collection[int] | None) -> Iterator[None]:
+    """Let policies that are made here know `--dataset.episodes`, which LeRobot does not tell them; None for all."""
+    token = _EPISODES.set(episodes)
+    try:
+        yield
+    finally:
+        _EPISODES.reset(token)
+
+
+def tasks_to_learn(dataset_meta: LeRobotDatasetMetadata) -> list[str]:
+    """The tasks of a dataset, in order of task_index; inside `only_episodes`, those of the chosen episodes."""
+    names, episodes = task_names(dataset_meta), _EPISODES.get()
+    if episodes is None:
+        return names
+    of_episodes = dataset_meta.episodes["tasks"][:]
+    chosen = {task for episode in episodes for task in of_episodes[episode]}
+    return [name for name in names if name in chosen]
 
 
 def feature_dim(features: dict[str, PolicyFeature], key: str) -> int:

@@ -35,7 +35,7 @@ from lerobot_wm.policies.common.config import (
     PolicyConfig,
     check_tasks,
     feature_dim,
-    task_names,
+    tasks_to_learn,
     train_new,
 )
 from lerobot_wm.policies.common.divergence import check_finite, check_finite_weights
@@ -341,7 +341,9 @@ class ActingPolicy(BasePolicy):
     def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Also learn the dataset's new tasks."""
         super().continue_training(dataset_meta)
-        self.add_tasks(task_names(dataset_meta))
+        tasks = tasks_to_learn(dataset_meta)
+        self.config.trained_tasks = list(dict.fromkeys([*self.config.known_tasks, *tasks]))
+        self.add_tasks(tasks)
         self.warn_if_actions_out_of_range(dataset_meta)
 
     def warn_if_actions_out_of_range(self, dataset_meta: LeRobotDatasetMetadata) -> None:
@@ -418,7 +420,7 @@ class ActingPolicy(BasePolicy):
         Raises:
             ValueError: A policy of several tasks is given no string, or one that it was not trained on.
         """
-        known = self.config.tasks
+        known = self.config.known_tasks
         given = batch.get(TASK) or [""] * batch_size  # lerobot-rollout gives "" when it was given none
         if isinstance(given, str):
             given = [given] * batch_size
@@ -429,9 +431,9 @@ class ActingPolicy(BasePolicy):
                 "strings (--task for lerobot-rollout)."
             )
         check_tasks(self.config, names)
-        index = {task: i for i, task in enumerate(known)}
+        index = {task: i for i, task in enumerate(self.config.tasks)}
         ids = torch.tensor([index[name] for name in names], device=self.state_scaling.offset.device)
-        return nn.functional.one_hot(ids, len(known)).float()
+        return nn.functional.one_hot(ids, len(self.config.tasks)).float()
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """`select_action` as a chunk of one: (B, 1, A)."""

@@ -22,6 +22,7 @@ _FILLED_IN = {
     "policy.output_features",
     "policy.use_peft",
     "policy.tasks",
+    "policy.trained_tasks",
     "policy.relative_indices",
     "policy.rssm.image_channels",
     "policy.rssm.action_dim",
