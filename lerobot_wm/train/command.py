@@ -13,7 +13,6 @@ from lerobot.configs import FeatureType, PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
-from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.logging_utils import MetricsTracker
 
 from lerobot_wm.constants import OBS_LATENT, TRAIN_LOG_NAME
@@ -29,7 +28,7 @@ from lerobot_wm.policies.common.checks import (
     names_given_by,
     rename_command,
 )
-from lerobot_wm.policies.common.config import PolicyConfig, only_episodes
+from lerobot_wm.policies.common.config import PolicyConfig, only_episodes, policy_features
 from lerobot_wm.policies.latent.config import LatentPolicyConfig, open_world_model
 from lerobot_wm.system import keep_freed_memory
 from lerobot_wm.train.flags import (
@@ -110,7 +109,7 @@ def check_new_policy(
     Raises:
         ValueError: They do not fit, which would be found out once the dataset is encoded.
     """
-    trial, features = deepcopy(policy), dataset_to_policy_features(meta.features)
+    trial, features = deepcopy(policy), policy_features(meta)
     trial.output_features = {key: each for key, each in features.items() if each.type is FeatureType.ACTION}
     trial.input_features = {key: each for key, each in features.items() if key not in trial.output_features}
     if policy.world_model_path is not None:
