@@ -5,7 +5,8 @@ and the headers of videos are read here; no image is decoded.
 """
 
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import av
@@ -118,6 +119,26 @@ def name_damaged_table(folder: Path) -> None:
         read_file(path, lambda path: sum(len(rows) for rows in pq.ParquetFile(path).iter_batches()))
 
 
+@contextmanager
+def strange_entries_named(root: Path) -> Iterator[None]:
+    """Turn errors that entries of the metadata cause while a dataset is checked into one that names the folder.
+
+    LeRobot takes them without a look: a shape that is no list, for example.
+
+    Raises:
+        DatasetError: As a check raised it, or in place of another error.
+    """
+    try:
+        yield
+    except DatasetError:
+        raise
+    except Exception as error:
+        raise DatasetError(
+            f"{root / 'meta'} has entries that LeRobot does not write ({type(error).__name__}: {brief(error)}): "
+            f"compare {INFO_PATH} with that of another dataset, or {FIX}."
+        ) from error
+
+
 def check_dataset(
     meta: LeRobotDatasetMetadata, *, partial: bool, chosen: Collection[int] | None = None
 ) -> None:
@@ -131,21 +152,13 @@ def check_dataset(
     Raises:
         DatasetError: Names the file, what is wrong with it and how to fix it.
     """
-    try:
-        _check_names(meta)
-        _check_numbering(meta, meta.features, meta.root / INFO_PATH)
-        episodes = _read_episodes(meta)
-        episodes["is_read"] = True if chosen is None else episodes["episode_index"].isin(chosen)
-        _check_tables(meta, episodes, partial)
-        for camera in meta.video_keys:
-            _check_videos(meta, camera, episodes, partial)
-    except DatasetError:
-        raise
-    except Exception as error:  # metadata that LeRobot takes without a look, such as a shape that is no list
-        raise DatasetError(
-            f"{meta.root / 'meta'} has entries that LeRobot does not write ({type(error).__name__}: {brief(error)}): "
-            f"compare {INFO_PATH} with that of another dataset, or {FIX}."
-        ) from error
+    _check_names(meta)
+    _check_numbering(meta, meta.features, meta.root / INFO_PATH)
+    episodes = _read_episodes(meta)
+    episodes["is_read"] = True if chosen is None else episodes["episode_index"].isin(chosen)
+    _check_tables(meta, episodes, partial)
+    for camera in meta.video_keys:
+        _check_videos(meta, camera, episodes, partial)
 
 
 def _check_names(meta: LeRobotDatasetMetadata) -> None:

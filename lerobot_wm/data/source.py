@@ -22,6 +22,7 @@ from lerobot_wm.data.check import (
     how_to_repair,
     name_damaged_metadata,
     name_damaged_table,
+    strange_entries_named,
 )
 from lerobot_wm.data.tables import check_finite_dataset, check_stats
 from lerobot_wm.errors import HubRefusalError
@@ -90,8 +91,9 @@ def open_dataset(
                 name_damaged_metadata(folder)
             raise
         is_download = is_snapshot(meta.root) or (meta.root / ".cache" / "huggingface").is_dir()
-        check_dataset(meta, partial=is_download, chosen=episodes)
-        check_stats(meta)
+        with strange_entries_named(meta.root):
+            check_dataset(meta, partial=is_download, chosen=episodes)
+            check_stats(meta)
     return meta
 
 

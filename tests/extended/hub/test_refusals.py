@@ -17,9 +17,11 @@ EVAL = "eval --env.type=metaworld_mt --env.task=reach-v3 --eval.n_episodes=1 --o
 
 @pytest.fixture(scope="module")
 def odd_repositories(hub: Hub) -> None:
-    """A dataset whose upload was interrupted before its version was tagged, and a private model."""
+    """A dataset whose upload was interrupted before its version was tagged, one of LeRobot 2, and a private model."""
     repo = hub.repos["dataset", "user/half"] = Repo(private=False)
     hub.commit(repo, "main", {"data/chunk-000/file-000.parquet": hub.store(b"")})
+    old = hub.repos["dataset", "user/old"] = Repo(private=False)
+    old.tags["v2.1"] = hub.commit(old, "main", {"meta/info.json": hub.store(b"{}")})
     hub.repos["model", "user/secret"] = Repo(private=True)
 
 
@@ -36,6 +38,11 @@ def odd_repositories(hub: Hub) -> None:
         (f"{ENCODE}user/wm --dataset.revision=v9", "write-user", "it has the versions v3.0"),
         (f"{ENCODE}user/wm --dataset.revision=nope", "write-user", "user/demos has no revision 'nope'"),
         (f"{ENCODE}user/wm --dataset.repo_id=user/half", "write-user", "its upload did not finish"),
+        (
+            f"{ENCODE}user/wm --dataset.repo_id=user/old",
+            "write-user",
+            "lerobot-wm repair --dataset.repo_id=user/old",
+        ),
         (f"{ENCODE}user/wm@v9", "write-user", "model user/wm has no revision 'v9'"),
         (f"{ENCODE}outputs/no/such/folder", "write-user", "neither a folder on this machine nor"),
         (
