@@ -28,13 +28,11 @@ def small(words: list[str]) -> list[str]:
     """The command with a few steps, a few samples and a small world model."""
     if words[:2] == ["lerobot-wm", "encode"]:
         return [*words, "--device=cpu"]
-    if words[:2] == ["lerobot-wm", "repair"]:
+    if words[1] in ("rename", "repair"):
         return words
     sizes = "--steps=2 --batch_size=2 --policy.device=cpu --num_workers=0"
     if "--policy.type=wm_rssm" in words:
         sizes += f" {SMALL_WORLD_MODEL} --policy.window_length=6"
-    if words[:2] == ["lerobot-wm", "rename"]:
-        return words
     kept = [word for word in words if not word.startswith(("--steps", "--batch_size"))]
     return [*kept, *sizes.split()]
 
