@@ -1,5 +1,6 @@
 """The numeric columns of a LeRobotDataset as tensors, read from Arrow in one pass."""
 
+import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,8 @@ from torch import Tensor
 
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.check import RECOMPUTE, DatasetError, brief
+
+logger = logging.getLogger(__name__)
 
 TEXT_DTYPES = ("string", "language")
 
@@ -102,6 +105,7 @@ def last_action_predicts_next(meta: LeRobotDatasetMetadata) -> bool:
 
 # An action's number counts as a target for a measured one where their difference varies this much less.
 _RELATIVE_SPREAD = 0.5
+_NO_DISTANCE = 1e-4
 
 
 def relative_to_state(meta: LeRobotDatasetMetadata, state_key: str = OBS_STATE) -> list[int]:
@@ -117,8 +121,14 @@ def relative_to_state(meta: LeRobotDatasetMetadata, state_key: str = OBS_STATE) 
     if shapes[0] != shapes[1] or not _tables(meta):
         return []
     action, state = (frame_values(meta, key).view(-1, *shapes[0]) for key in (ACTION, state_key))  # (N, A)
-    spread = action.std(0)
-    chosen = (spread > 0) & ((action - state).std(0) <= _RELATIVE_SPREAD * spread)  # (A,)
+    spread, distance = action.std(0), (action - state).std(0)  # (A,)
+    chosen = (spread > 0) & (distance <= _RELATIVE_SPREAD * spread)  # (A,)
+    if chosen.any() and (distance[chosen] <= _NO_DISTANCE * spread[chosen]).all():
+        logger.warning(
+            "The actions of %s are the state of the same frame: a policy learns to stay where it is. Record what was "
+            "commanded, or take each action from the next frame's state.",
+            meta.repo_id,
+        )
     return chosen.nonzero().flatten().tolist()
 
 
