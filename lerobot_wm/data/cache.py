@@ -23,7 +23,7 @@ from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.data.source import is_snapshot
 from lerobot_wm.errors import disk_problem
 from lerobot_wm.files import appears_whole, sole_writer
-from lerobot_wm.nn.images import channels_first, resize_images
+from lerobot_wm.nn.images import channels_first, resize_bytes
 from lerobot_wm.system import usable_cores
 
 logger = logging.getLogger(__name__)
@@ -141,9 +141,7 @@ class CameraCache:
             # One by one, as a frame fits into the processor's cache.
             for image in self._images(row):
                 if image.shape[-2:] != size:
-                    image = (
-                        (resize_images(image.contiguous()[None] / 255, size)[0] * 255).round().to(torch.uint8)
-                    )
+                    image = resize_bytes(image[None], size)[0]
                 self._frames[position] = image.permute(1, 2, 0).numpy()
                 position += 1
         except Exception as error:  # decoders do not document what they raise for damaged files

@@ -38,8 +38,8 @@ def random_crop(images: Tensor, pad: int) -> Tensor:
 def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize images by antialiased bilinear interpolation; images of the right size are returned unchanged.
 
-    The result is rounded to the 256 levels of a camera, so that storing it as uint8 loses nothing. Each axis is scaled
-    by itself: the whole view stays visible, the aspect ratio does not.
+    They have a camera's 256 levels before and after, so that storing them as uint8 loses nothing. Each axis is scaled
+    by itself: the whole view stays visible, the aspect ratio does not. On a GPU a few values differ by one level.
 
     Args:
         images: (..., C, H, W) in [0, 1].
@@ -50,8 +50,20 @@ def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
     """
     if images.shape[-2:] == size:
         return images
-    resized = F.interpolate(images.flatten(0, -4), size=size, mode="bilinear", antialias=True)
-    return ((resized * _LEVELS).round() / _LEVELS).unflatten(0, images.shape[:-3])
+    flat = images.flatten(0, -4)  # (N, C, H, W)
+    if images.device.type == "cpu":
+        resized = resize_bytes((flat * _LEVELS).round().byte(), size).to(images.dtype) / _LEVELS
+    else:  # where whole numbers cannot be interpolated
+        resized = F.interpolate(flat, size=size, mode="bilinear", antialias=True)
+        resized = (resized * _LEVELS).round() / _LEVELS
+    return resized.unflatten(0, images.shape[:-3])
+
+
+def resize_bytes(images: Tensor, size: tuple[int, int]) -> Tensor:
+    """`resize_images` of (N, C, H, W) uint8 on the CPU; fast where channels are last in memory."""
+    # With another layout, PyTorch interpolates by other, slower code.
+    images = images.contiguous(memory_format=torch.channels_last)
+    return F.interpolate(images, size=size, mode="bilinear", antialias=True)
 
 
 def stack_images(images: Sequence[Tensor], size: tuple[int, int]) -> Tensor:

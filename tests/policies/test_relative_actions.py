@@ -12,7 +12,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.tables import relative_to_state
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
-from tests.recording import record, train_flags, vector
+from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
+from lerobot_wm.world_model.config import RSSMConfig
+from tests.recording import camera, record, train_flags, vector
 
 LENGTHS = (30, 20)
 
@@ -47,6 +49,38 @@ def test_targets_are_told_from_velocities(arm: LeRobotDataset, demos: LeRobotDat
     assert relative_to_state(arm.meta) == [0, 1]
     # Meta-World: four velocities beside a state of four numbers.
     assert relative_to_state(demos.meta) == []
+
+
+def test_the_filter_is_not_told_actions_that_the_last_one_predicts(
+    demos: LeRobotDataset, tmp_path: Path
+) -> None:
+    features = {"observation.image": camera(48, 48), "observation.state": vector(3), "action": vector(3)}
+
+    def slow(t: int, length: int) -> dict[str, Any]:
+        state = np.sin(np.array([t / 9, t / 11, t / 13], dtype=np.float32))
+        return {"observation.state": state, "action": state + np.float32(0.02)}
+
+    dataset = record(tmp_path / "dataset", features, [("Lift", 60)], slow)
+    for meta, share in ((dataset.meta, 0.5), (demos.meta, 0.0)):
+        config = WMRSSMConfig(device="cpu", push_to_hub=False)
+        config.fill_from_dataset(meta)
+        assert config.rssm.hidden_action_share == share
+    chosen = WMRSSMConfig(device="cpu", push_to_hub=False, rssm=RSSMConfig(hidden_action_share=0.0))
+    chosen.fill_from_dataset(dataset.meta)
+    assert chosen.rssm.hidden_action_share == 0.0
+
+
+def test_actions_that_are_the_state_itself_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def copied(t: int, length: int) -> dict[str, Any]:
+        state = np.array([np.sin(t / 5), t / length], dtype=np.float32)
+        return {"observation.state": state, "action": state}
+
+    features = {"observation.state": vector(2), "action": vector(2)}
+    dataset = record(tmp_path / "dataset", features, [("Lift", 20)], copied)
+    assert relative_to_state(dataset.meta) == [0, 1]
+    assert "stay where it is" in caplog.text
 
 
 def test_a_policy_returns_units_and_stays_near_an_unseen_state(
