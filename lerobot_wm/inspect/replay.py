@@ -339,7 +339,8 @@ def replay_figure(result: Replay, episode: int, fps: float) -> Figure:
         panel.tick_params(labelsize=7)
     for panel in list(figure.axes)[n_joints:]:
         panel.set_axis_off()
-    figure.supxlabel("seconds", fontsize=8)
+    for panel in figure.axes[n_joints - columns : n_joints]:
+        panel.set_xlabel("seconds", fontsize=7)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
     return figure
