@@ -264,9 +264,8 @@ def _hub_answer(error: HfHubHTTPError) -> str:
             )
     answer = one_line(error.server_message or error)
     if status in (401, 403):
-        access = "read" if error.request.method in _READING else "write"
-        return f"the Hub refuses ({status}, {answer}): {LOGIN}, with {access} access to {repo_id}."
-    return f"the Hub answered {status} to {error.request.method} {url}: {answer}"
+        return f"the Hub refuses ({status}, {answer}): {LOGIN}, with a token that may use {url.path}."
+    return f"the Hub answered {status} for {url}: {answer}"
 
 
 def _repository_in(path: str) -> tuple[str, str, str | None]:

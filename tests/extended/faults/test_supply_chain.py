@@ -19,7 +19,7 @@ UNSAFE_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal
 # Written for Meta-World in memory; and the name of an error.
 USED_OF_PICKLE = {
     "envs/simulation.py": {"dumps"},
-    "policies/frozen_backbone/backbone.py": {"UnpicklingError"},
+    "policies/frozen_backbone/modeling_frozen_backbone.py": {"UnpicklingError"},
 }
 
 LICENSES = {
