@@ -12,6 +12,7 @@ from benchmarks.data import REPO_ID, demonstrations, latents
 from benchmarks.timing import Prepared, rate
 from lerobot_wm.constants import ACTION, FPS, OBS_IMAGE, OBS_LATENT, OBS_STATE, REWARD
 from lerobot_wm.data.loader import EpochOrder, RamLoader
+from lerobot_wm.system import keep_freed_memory
 
 CPU = torch.device("cpu")
 
@@ -87,6 +88,8 @@ def _loader(dataset: LeRobotDataset, batch: int, workers: int, drop_n_last_frame
 
 
 def _in_ram(loader: DataLoader) -> RamLoader:
+    # As in `lerobot-wm train`: without it, how long a batch takes depends on what the process allocated before.
+    keep_freed_memory()
     # The same samples in the same order, looked up epoch by epoch as in `lerobot-wm train`.
     assert isinstance(loader.sampler, _Endless)
     assert isinstance(loader.sampler.sampler, EpisodeAwareSampler)
