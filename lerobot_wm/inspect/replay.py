@@ -1,7 +1,7 @@
 """`lerobot-wm replay`: how far policies are from the recorded actions of a dataset, without a robot.
 
-A policy is shown the recorded images and states, and its actions are compared with the recorded ones. The result depends
-on which earlier actions its memory gets: on a robot they are its own, so that its small errors feed back.
+A policy is shown the recorded images and states, and its actions are compared with the recorded ones. The result
+depends on which earlier actions its memory gets: on a robot they are its own, so that its small errors feed back.
 """
 
 import copy
