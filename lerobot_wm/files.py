@@ -132,3 +132,21 @@ def _lock(path: Path, operation: int) -> IO:
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
         file.close()
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Write a folder that must not exist yet, and appears when it is complete.
+
+    Yields:
+        The folder to write into.
+
+    Raises:
+        FileExistsError: It exists already.
+        BlockingIOError: Another process is writing it.
+    """
+    with sole_writer(path):
+        if path.exists():
+            raise FileExistsError(f"{path} already exists: choose another --output_root, or remove it.")
+        with appears_whole(path) as temporary:
+            yield temporary

@@ -21,7 +21,7 @@ from lerobot_wm.constants import REWARD
 from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.data.schema import RELABEL_RECORD
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.files import appears_whole, sole_writer
+from lerobot_wm.files import new_folder
 
 
 @dataclass
@@ -68,13 +68,8 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
             f"--reward={reward}: {source.repo_id} has no such column of the type and shape of its '{REWARD}', "
             f"{kinds[REWARD]}. Columns of that type and shape: {', '.join(alike) or 'none'}."
         )
-    with sole_writer(output_root):
-        if output_root.exists():
-            raise FileExistsError(
-                f"{output_root} already exists: choose another --output_root, or remove it."
-            )
-        with appears_whole(output_root) as temporary:
-            _write(source, reward, temporary)
+    with new_folder(output_root) as temporary:
+        _write(source, reward, temporary)
     return LeRobotDataset(output_repo_id, root=output_root)
 
 

@@ -20,7 +20,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.files import appears_whole, sole_writer
+from lerobot_wm.files import new_folder
 
 
 @dataclass
@@ -64,13 +64,8 @@ def rename(
         raise ValueError(
             f"--rename_map: two features would be named {', '.join(twice)}. Give one another name."
         )
-    with sole_writer(output_root):
-        if output_root.exists():
-            raise FileExistsError(
-                f"{output_root} already exists: choose another --output_root, or remove it."
-            )
-        with appears_whole(output_root) as temporary:
-            _write(Path(source.root), rename_map, temporary)
+    with new_folder(output_root) as temporary:
+        _write(Path(source.root), rename_map, temporary)
     return LeRobotDataset(output_repo_id, root=output_root)
 
 

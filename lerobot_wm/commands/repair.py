@@ -15,7 +15,7 @@ from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_wm.data.source import SourceConfig, dataset_folder, open_dataset
-from lerobot_wm.files import appears_whole, sole_writer
+from lerobot_wm.files import new_folder
 from lerobot_wm.system import quiet
 
 
@@ -42,16 +42,11 @@ def repair(repo_id: str, root: Path, output_root: Path) -> None:
         BlockingIOError: Another process is writing it.
         DatasetError: The copy would have other faults, such as missing files; nothing is written.
     """
-    with sole_writer(output_root):
-        if output_root.exists():
-            raise FileExistsError(
-                f"{output_root} already exists: choose another --output_root, or remove it."
-            )
-        with appears_whole(output_root) as copy, quiet():
-            shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".cache", "images"))
-            _convert(repo_id, copy)
-            _number_frames(copy)
-            open_dataset(repo_id, copy)
+    with new_folder(output_root) as copy, quiet():
+        shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".cache", "images"))
+        _convert(repo_id, copy)
+        _number_frames(copy)
+        open_dataset(repo_id, copy)
 
 
 def _convert(repo_id: str, root: Path) -> None:
