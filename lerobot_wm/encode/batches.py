@@ -21,8 +21,8 @@ from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.tables import column_tensor
 from lerobot_wm.files import appears_whole
 from lerobot_wm.nn.images import stack_images
-from lerobot_wm.policies.common.checks import OWN_NAMES, names_before
-from lerobot_wm.policies.common.policy import join_vectors
+from lerobot_wm.policies.common.features import join_vectors
+from lerobot_wm.policies.common.names import OWN_NAMES, names_before
 from lerobot_wm.policies.latent.policy import EncoderPolicy, encoder_config
 from lerobot_wm.workers import check_same_settings
 

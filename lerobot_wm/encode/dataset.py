@@ -23,8 +23,9 @@ from lerobot_wm.data.source import dataset_folder, is_snapshot
 from lerobot_wm.data.tables import check_finite_dataset
 from lerobot_wm.encode.batches import LatentBatches, episode_batches
 from lerobot_wm.files import appears_whole, sole_writer
-from lerobot_wm.policies.common.checks import OWN_NAMES, check_reads, renamed
-from lerobot_wm.policies.common.config import policy_features
+from lerobot_wm.policies.common.checks import check_reads
+from lerobot_wm.policies.common.features import policy_features
+from lerobot_wm.policies.common.names import OWN_NAMES, renamed
 from lerobot_wm.policies.latent.policy import (
     EncoderPolicy,
     encoder_config,

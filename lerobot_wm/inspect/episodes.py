@@ -14,7 +14,7 @@ from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.nn.images import camera_images, resize_images
 from lerobot_wm.policies.common.checks import check_reads
 from lerobot_wm.policies.common.config import check_cameras_present
-from lerobot_wm.policies.common.policy import join_vectors
+from lerobot_wm.policies.common.features import join_vectors
 from lerobot_wm.policies.latent.policy import LatentPolicy, encoder_config, load_encoder
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy

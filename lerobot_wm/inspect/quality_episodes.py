@@ -17,7 +17,7 @@ from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.data.tables import column_tensor
 from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.nn.images import stack_images
-from lerobot_wm.policies.common.policy import join_vectors
+from lerobot_wm.policies.common.features import join_vectors
 from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import RSSMState
 

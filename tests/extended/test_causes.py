@@ -27,7 +27,7 @@ from lerobot_wm.data.source import open_dataset
 from lerobot_wm.encode.dataset import _remove_cameras_from_episodes
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.errors import disk_problem, exit_with_one_line
-from lerobot_wm.policies.common.config import only_episodes
+from lerobot_wm.policies.common.tasks import only_episodes
 from lerobot_wm.system import name_user, opengl_fix
 from lerobot_wm.train.flags import check_episodes, check_flags, check_login, write_beside_checkpoint
 from lerobot_wm.train.resume import settings_in

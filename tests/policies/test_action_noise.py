@@ -8,7 +8,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
-from lerobot_wm.policies.common.policy import ActingPolicy, ActionNoise
+from lerobot_wm.policies.common.acting_policy import ActingPolicy
+from lerobot_wm.policies.common.actions import ActionNoise
 
 STD = 0.3
 

@@ -7,7 +7,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_wm.nn.images import camera_images, resize_images, side_by_side, stack_images
-from lerobot_wm.policies.common.policy import check_observation
+from lerobot_wm.policies.common.acting_policy import check_observation
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.config import RSSMConfig

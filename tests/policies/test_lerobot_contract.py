@@ -25,7 +25,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import save_file
 from torch.utils.data import DataLoader
 
-from lerobot_wm.policies.common.config import image_keys
+from lerobot_wm.policies.common.features import image_keys
 from lerobot_wm.policies.common.policy import BasePolicy
 from tests.policies.golden import fill, output
 from tests.recording import FRONT, WRIST, camera, record, vector

@@ -3,11 +3,8 @@
 import json
 import logging
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -19,18 +16,12 @@ from lerobot.utils.constants import DEFAULT_FEATURES, OBS_STR
 from lerobot_wm.constants import ACTION, OBS_IMAGES, OBS_LATENT, OBS_STATE
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.tasks import all_tasks, resolve_tasks, task_description, tasks_of_one_description
-from lerobot_wm.policies.common.config import (
-    PolicyConfig,
-    check_cameras_present,
-    check_tasks,
-    image_keys,
-    policy_features,
-    train_new,
-)
+from lerobot_wm.policies.common.config import PolicyConfig, check_cameras_present, train_new
+from lerobot_wm.policies.common.features import image_keys, policy_features
+from lerobot_wm.policies.common.names import OWN_NAMES, current_names, names_before, renamed
+from lerobot_wm.policies.common.tasks import check_tasks
 
 logger = logging.getLogger(__name__)
-
-OWN_NAMES: Mapping[str, str] = MappingProxyType({})  # the rename_map that changes no name
 
 
 def check_fit(
@@ -149,47 +140,6 @@ def check_has_stats(dataset_meta: LeRobotDatasetMetadata) -> None:
             f"{dataset_meta.repo_id} has no statistics ({dataset_meta.root}/{STATS_PATH}), which scale actions and "
             "proprioception: compute them with lerobot-edit-dataset --operation.type=recompute_stats."
         )
-
-
-def renamed(features: Mapping[str, PolicyFeature], rename_map: Mapping[str, str]) -> dict[str, PolicyFeature]:
-    """The features of a dataset or environment under the names that `--rename_map` gives them.
-
-    Raises:
-        ValueError: Two get the same name; which one is read would depend on their order.
-    """
-    names = {old: rename_map.get(old, old) for old in features}
-    for old, new in names.items():
-        others = [key for key, name in names.items() if name == new and key != old]
-        if others:
-            raise ValueError(
-                f"--rename_map: '{old}' and '{others[0]}' would both be named '{new}'. Give the one that is not to be "
-                "read another name too."
-            )
-    return {names[old]: feature for old, feature in features.items()}
-
-
-def names_before(keys: Iterable[str], rename_map: Mapping[str, str]) -> list[str]:
-    """The names that features have in the dataset itself, before `--rename_map` gives them these `keys`."""
-    before = {new: old for old, new in rename_map.items()}
-    return [before.get(key, key) for key in keys]
-
-
-_RENAME_MAP: ContextVar[Mapping[str, str]] = ContextVar("rename_map", default=OWN_NAMES)
-
-
-@contextmanager
-def names_given_by(rename_map: Mapping[str, str]) -> Iterator[None]:
-    """Let policies that are loaded here know `--rename_map`, which LeRobot gives to its processors only."""
-    token = _RENAME_MAP.set(rename_map)
-    try:
-        yield
-    finally:
-        _RENAME_MAP.reset(token)
-
-
-def current_names() -> Mapping[str, str]:
-    """The rename_map of the surrounding `names_given_by`."""
-    return _RENAME_MAP.get()
 
 
 def dataset_cameras(config: PolicyConfig, dataset_meta: LeRobotDatasetMetadata) -> dict[str, PolicyFeature]:

@@ -1,9 +1,7 @@
 """The settings that all our policy types share."""
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
@@ -11,10 +9,10 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.optim import LRSchedulerConfig
-from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_LATENT, OBS_STATE
+from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_wm.nn.images import channels_first
+from lerobot_wm.policies.common.features import feature_dim, image_keys, is_image
 from lerobot_wm.policies.common.optim import FinalDecayConfig, FusedAdamConfig
 
 logger = logging.getLogger(__name__)
@@ -259,76 +257,6 @@ class PolicyConfig(PreTrainedConfig):
             )
 
 
-@dataclass
-class ActingConfig(PolicyConfig):
-    """A policy that chooses actions: a head on [features of the images, one-hot task, proprioception].
-
-    Args:
-        hidden_dims: Widths of the hidden layers of every head.
-        dropout: Dropout of the actor.
-        action_noise: Standard deviation of Gaussian noise on the actions at test time, where the dataset's actions span
-            [-1, 1]. It frees a policy that hovers in a place where no demonstration ends.
-        relative_actions: Learn targets relative to the state: the heads learn a_t minus the measured state where the
-            action is a target for it, such as a joint's position. The policy still returns the dataset's units. None
-            finds these numbers in the dataset (see `data.tables.relative_to_state`), true takes all, false none.
-        tasks: Task strings in one-hot order, taken from the dataset when the policy is created.
-        trained_tasks: Those of them that the training episodes had; empty in older checkpoints, for all.
-        relative_indices: Which numbers of the action these are, and of observation.state; filled when the policy is
-            created.
-    """
-
-    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
-    dropout: float = 0.1
-    action_noise: float = 0.0
-    relative_actions: bool | None = None
-    tasks: list[str] = field(default_factory=list)
-    trained_tasks: list[str] = field(default_factory=list)
-    relative_indices: list[int] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.action_noise < 0:
-            raise ValueError(
-                f"--policy.action_noise={self.action_noise:g}: a standard deviation is 0 or more."
-            )
-
-    @property
-    def action_dim(self) -> int:
-        """Size of the action."""
-        return feature_dim(self.output_features, ACTION)
-
-    @property
-    def known_tasks(self) -> list[str]:
-        """The tasks that the policy was trained on."""
-        return self.trained_tasks or self.tasks
-
-    def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
-        """Take the tasks; name vectors that are there and not read."""
-        self.tasks, self.trained_tasks = task_names(dataset_meta), tasks_to_learn(dataset_meta)
-        unread = [
-            key
-            for key, feature in dataset_meta.features.items()
-            if key.startswith("observation.")
-            and feature["dtype"].startswith(("float", "int"))
-            and len(feature["shape"]) == 1
-            and key not in (*self.state_vectors, OBS_ENV_STATE, OBS_LATENT)
-        ]
-        if unread:
-            logger.info(
-                "Not read: %s. --policy.state_keys=%s reads them as proprioception.",
-                ", ".join(unread),
-                ",".join([*self.state_vectors, *unread]),
-            )
-
-    @property
-    def relative_state_indices(self) -> list[int]:
-        """Where the numbers of `relative_indices` are in the proprioceptive state."""
-        vectors = self.state_vectors
-        before = vectors[: vectors.index(OBS_STATE)] if OBS_STATE in vectors else []
-        start = sum(feature_dim(self.input_features, key) for key in before)
-        return [start + index for index in self.relative_indices]
-
-
 _HINTS = {
     OBS_STATE: "Add it to the robot or environment (--env.obs_type=pixels_agent_pos of LeRobot's environments)",
     OBS_ENV_STATE: (
@@ -341,11 +269,6 @@ _HINTS = {
 def train_new(config: PreTrainedConfig) -> str:
     """Advice for the end of a message: how to get a policy with other networks."""
     return f"train a new {config.type} with --policy.type={config.type} instead of --policy.path"
-
-
-def is_image(key: str) -> bool:
-    """Whether a key of a batch names a camera's images."""
-    return key.startswith("observation.image") and not key.endswith("_is_pad")
 
 
 def check_cameras_present(config: PolicyConfig, present: Collection[str], where: str) -> None:
@@ -361,77 +284,6 @@ def check_cameras_present(config: PolicyConfig, present: Collection[str], where:
             "Add them (--env.camera_name=corner2,topview for metaworld_mt), or map cameras with the same view to these "
             "names with --rename_map."
         )
-
-
-def check_tasks(config: Any, names: Iterable[str]) -> None:
-    """Check that an acting policy of this configuration was trained on the tasks of these names.
-
-    Raises:
-        ValueError: A task is unknown; names it and the known ones.
-    """
-    unknown = set(names) - set(config.known_tasks)
-    if unknown:
-        raise ValueError(
-            f"Unknown task {sorted(unknown)}; this policy was trained on {config.known_tasks}. Use one of these "
-            "strings, or continue training with --policy.path on a dataset that has the new task."
-        )
-
-
-def task_names(dataset_meta: LeRobotDatasetMetadata) -> list[str]:
-    """The task strings of a dataset, in order of task_index."""
-    return [str(task) for task in dataset_meta.tasks.index]
-
-
-_EPISODES: ContextVar[Collection[int] | None] = ContextVar("episodes", default=None)
-
-
-@contextmanager
-def only_episodes(episodes: Collection[int] | None) -> Iterator[None]:
-    """Let policies that are made here know `--dataset.episodes`, which LeRobot does not tell them; None for all."""
-    token = _EPISODES.set(episodes)
-    try:
-        yield
-    finally:
-        _EPISODES.reset(token)
-
-
-def tasks_to_learn(dataset_meta: LeRobotDatasetMetadata) -> list[str]:
-    """The tasks of a dataset, in order of task_index; inside `only_episodes`, those of the chosen episodes."""
-    names, episodes = task_names(dataset_meta), _EPISODES.get()
-    if episodes is None:
-        return names
-    of_episodes = dataset_meta.episodes["tasks"][:]
-    chosen = {task for episode in episodes for task in of_episodes[episode]}
-    return [name for name in names if name in chosen]
-
-
-def feature_dim(features: dict[str, PolicyFeature], key: str) -> int:
-    """Size of the vector feature `key`.
-
-    Raises:
-        ValueError: The feature is missing, or is no vector.
-    """
-    if key not in features:
-        raise ValueError(f"The dataset has no '{key}'; it has {sorted(features)}.")
-    shape = tuple(features[key].shape)
-    if len(shape) != 1:
-        raise ValueError(f"'{key}' has the shape {shape}; expected a vector (N,).")
-    return shape[0]
-
-
-def policy_features(dataset_meta: LeRobotDatasetMetadata) -> dict[str, PolicyFeature]:
-    """LeRobot's description of a dataset's features, with the channels of all cameras first."""
-    features = dataset_to_policy_features(dataset_meta.features)
-    cameras = {
-        key: PolicyFeature(FeatureType.VISUAL, channels_first(features[key].shape))
-        for key in image_keys(features)
-    }
-    return features | cameras
-
-
-def image_keys(features: dict[str, PolicyFeature]) -> list[str]:
-    """The camera keys among the features, in order."""
-    return [key for key, feature in features.items() if feature.type is FeatureType.VISUAL]
 
 
 def training_dtype(dtype: str | None, device: str) -> str:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import DONE, REWARD, SUCCESS
 from lerobot_wm.data.tables import frame_values
-from lerobot_wm.policies.common.config import ActingConfig
+from lerobot_wm.policies.common.acting_config import ActingConfig
 from lerobot_wm.policies.common.optim import ActorCosineConfig
 from lerobot_wm.rl.agent import IQLAgent
 

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_wm.policies.common.config import ActingConfig, policy_features
+from lerobot_wm.policies.common.acting_config import ActingConfig
+from lerobot_wm.policies.common.features import policy_features
 
 ENCODERS = ("small", "resnet18", "resnet34")
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder
 from lerobot_wm.nn.images import camera_images, random_crop
-from lerobot_wm.policies.common.policy import ActingPolicy, check_observation
+from lerobot_wm.policies.common.acting_policy import ActingPolicy, check_observation
 from lerobot_wm.policies.e2e.config import E2EConfig
 
 

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torchvision.transforms.v2 import functional as vision
 
-from lerobot_wm.policies.common.policy import Statistics
+from lerobot_wm.policies.common.features import Statistics
 from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import (
     RGB_CHANNELS,
     FrozenBackboneConfig,

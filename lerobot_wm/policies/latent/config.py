@@ -9,13 +9,11 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
 from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
+from lerobot_wm.policies.common.acting_config import ActingConfig
 from lerobot_wm.policies.common.checkpoint import CheckpointError, open_checkpoint
-from lerobot_wm.policies.common.config import (
-    ActingConfig,
-    feature_dim,
-    task_names,
-    train_new,
-)
+from lerobot_wm.policies.common.config import train_new
+from lerobot_wm.policies.common.features import feature_dim
+from lerobot_wm.policies.common.tasks import task_names
 from lerobot_wm.policies.world_model.config import WorldModelConfig
 
 _MIN_LATENT_STD = 1e-5  # below it, scaling latents to unit variance would scale rounding errors

@@ -14,14 +14,9 @@ from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
 from lerobot_wm.data.latents import weights_fingerprint
 from lerobot_wm.nn.images import camera_images, side_by_side
 from lerobot_wm.nn.normalize import Affine
+from lerobot_wm.policies.common.acting_policy import ActingPolicy, check_observation
 from lerobot_wm.policies.common.checkpoint import read_config, split_revision
-from lerobot_wm.policies.common.policy import (
-    ActingPolicy,
-    Statistics,
-    check_observation,
-    join_vectors,
-    statistics,
-)
+from lerobot_wm.policies.common.features import Statistics, join_vectors, statistics
 from lerobot_wm.policies.latent.config import LatentPolicyConfig, open_world_model
 from lerobot_wm.policies.world_model.config import WorldModelConfig
 from lerobot_wm.policies.world_model.policy import WorldModelPolicy

@@ -10,7 +10,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_wm.constants import ACTION, REWARD
 from lerobot_wm.data.tables import last_action_predicts_next
 from lerobot_wm.nn.conv import IMAGE_SIZE
-from lerobot_wm.policies.common.config import feature_dim
+from lerobot_wm.policies.common.features import feature_dim
 from lerobot_wm.policies.common.iql import reward_columns
 from lerobot_wm.policies.common.optim import FusedAdamConfig
 from lerobot_wm.policies.world_model.config import WorldModelConfig

@@ -10,8 +10,8 @@ from torch import Tensor
 from lerobot_wm.constants import ACTION
 from lerobot_wm.nn.images import camera_images
 from lerobot_wm.policies.common.config import compiled
+from lerobot_wm.policies.common.features import Statistics, join_vectors, joined_statistics, statistics
 from lerobot_wm.policies.common.iql import FrameColumn
-from lerobot_wm.policies.common.policy import Statistics, join_vectors, joined_statistics, statistics
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.world_model.policy import WorldModelPolicy
 from lerobot_wm.world_model.model import WorldModel

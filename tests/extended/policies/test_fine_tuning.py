@@ -21,9 +21,9 @@ from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTenso
 
 from lerobot_wm.encode.dataset import encode_to_cache
 from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.policies.common.acting_policy import ActingPolicy
 from lerobot_wm.policies.common.checkpoint import CheckpointError
 from lerobot_wm.policies.common.iql import IQLConfig
-from lerobot_wm.policies.common.policy import ActingPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import SMALL_WORLD_MODEL, TRAIN_FLAGS
 from tests.recording import FRONT, WRIST, camera, record, train_flags, vector

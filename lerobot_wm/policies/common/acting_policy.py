@@ -1,0 +1,196 @@
+"""The base class of the policies that choose actions."""
+
+import logging
+from typing import Any
+
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from torch import Tensor, nn
+
+from lerobot_wm.constants import ACTION, TASK
+from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.nn.normalize import Affine
+from lerobot_wm.policies.common.acting_config import ActingConfig
+from lerobot_wm.policies.common.actions import ActionNoise, RelativeToState, action_range
+from lerobot_wm.policies.common.config import PolicyConfig
+from lerobot_wm.policies.common.features import Statistics, join_vectors, joined_statistics
+from lerobot_wm.policies.common.policy import BasePolicy
+from lerobot_wm.policies.common.tasks import check_tasks, tasks_to_learn
+
+logger = logging.getLogger(__name__)
+
+_RANGE_TOLERANCE = 0.05  # share of a dataset's range that noise in a few frames adds
+_WHITE = 1.01  # resizing and floating point may exceed 1 a little; a camera's bytes exceed this
+
+
+class ActingPolicy(BasePolicy):
+    """Base of the policies that choose actions: tasks as one-hot ids, scaled proprioception and actions, action noise.
+
+    Subclasses also define `observation_networks`, `task_start`, `actor_mean` and `select_action`.
+    """
+
+    config: ActingConfig
+
+    def build(self) -> None:
+        """Make the scalings."""
+        self.state_scaling = Affine(self.config.state_dim)
+        self.action_scaling = Affine(self.config.action_dim)
+        self.relative_to_state = RelativeToState(self.config)
+        self._action_noise = ActionNoise(self.config.action_noise)
+
+    def fit_dataset(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Scale proprioception to unit variance and actions to [-1, 1]."""
+        self.state_scaling.set_standard(*joined_statistics(stats, self.config.state_vectors, "mean", "std"))
+        self.action_scaling.set_range(*action_range(self.config, stats, dataset_meta))
+
+    def scaled(self, action: Tensor, state: Tensor) -> Tensor:
+        """Actions (B, A) as the heads learn them, given proprioception (B, P) at the same frames."""
+        return self.action_scaling(self.relative_to_state(action, state))
+
+    def unscaled(self, scaled: Tensor, state: Tensor) -> Tensor:
+        """Undo `scaled`."""
+        return self.relative_to_state.inverse(self.action_scaling.inverse(scaled), state)
+
+    def state_at(self, batch: dict[str, Any], t: int | None = None) -> Tensor:
+        """Proprioception of a batch in the dataset's units.
+
+        Args:
+            batch: Frames (B, ...), or windows of them (B, T, ...).
+            t: Which frame of the windows; None where the batch holds frames.
+
+        Returns:
+            (B, P); P is 0 for a policy without proprioception.
+        """
+        frames = {key: batch[key] if t is None else batch[key][:, t] for key in self.config.state_vectors}
+        state = join_vectors(frames, self.config.state_vectors)
+        return self.state_scaling.offset.new_zeros(self.batch_size(batch), 0) if state is None else state
+
+    def batch_size(self, batch: dict[str, Any]) -> int:
+        """B of a batch, in training or at test time."""
+        keys = (*self.config.input_features, ACTION)
+        return next(len(batch[key]) for key in keys if isinstance(batch.get(key), Tensor))
+
+    def scaled_actions(self, batch: dict[str, Any]) -> Tensor:
+        """A training batch's actions (B, A) as the heads learn them."""
+        has_windows = self.config.observation_delta_indices is not None  # frames t and t+1
+        return self.scaled(batch[ACTION], self.state_at(batch, 0 if has_windows else None))
+
+    def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Also learn the dataset's new tasks."""
+        super().continue_training(dataset_meta)
+        tasks = tasks_to_learn(dataset_meta)
+        self.config.trained_tasks = list(dict.fromkeys([*self.config.known_tasks, *tasks]))
+        self.add_tasks(tasks)
+        self.warn_if_actions_out_of_range(dataset_meta)
+
+    def warn_if_actions_out_of_range(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Warn of actions in a dataset that this policy, scaled as in its first training, cannot command."""
+        low, high = action_range(self.config, dataset_meta.stats or {}, dataset_meta)  # (A,), on the CPU
+        ends = (torch.full_like(self.action_scaling.offset, end) for end in (-1.0, 1.0))
+        lowest, highest = (self.action_scaling.inverse(end).cpu() for end in ends)  # (A,)
+        tolerance = _RANGE_TOLERANCE * (high - low)
+        outside = (low < lowest - tolerance) | (high > highest + tolerance)
+        for i in torch.nonzero(outside).flatten().tolist():
+            logger.warning(
+                "Number %d of the actions ranges from %.3g to %.3g in %s; this policy was first trained on %.3g to "
+                "%.3g and cannot command the rest. If that matters, train a new --policy.type=%s on both datasets.",
+                *(i, low[i], high[i], dataset_meta.repo_id, lowest[i], highest[i], self.config.type),
+            )
+
+    def observation_networks(self) -> list[MLP]:
+        """The networks that read the observation (B, O), and perhaps more after it."""
+        raise NotImplementedError
+
+    @property
+    def task_start(self) -> int:
+        """Index in the observation at which the one-hot task id begins."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def add_tasks(self, tasks: list[str]) -> None:
+        """Add tasks after the known ones, with zero weights, so that known tasks are acted on as before.
+
+        Args:
+            tasks: Task strings; known ones are skipped.
+        """
+        new = [task for task in tasks if task not in self.config.tasks]
+        if not new:
+            return
+        for network in self.observation_networks():
+            network.insert_inputs(self.task_start + len(self.config.tasks), len(new))
+        logger.info("New tasks: %s; known ones: %s", new, self.config.tasks)
+        self.config.tasks = [*self.config.tasks, *new]
+
+    def actor_mean(self, observation: Tensor) -> Tensor:
+        """The policy's action (B, A), scaled to [-1, 1], for observations (B, O)."""
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        """Forget the episode; LeRobot calls this between episodes."""
+        self._action_noise.reset()
+
+    def act(self, observation: Tensor, state: Tensor) -> Tensor:
+        """The policy's mean action, clipped to the dataset's range, in its units.
+
+        Args:
+            observation: What the heads read, (B, O).
+            state: Proprioception in the dataset's units, (B, P).
+
+        Returns:
+            (B, A).
+        """
+        return self.unscaled(self.actor_mean(observation).clamp(-1, 1), state)
+
+    def with_noise(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
+        """Actions (B, A) with `action_noise`, clipped to the dataset's range; `batch` is that of `select_action`."""
+        if self.config.action_noise == 0:
+            return action
+        state = self.state_at(batch)
+        noisy = self._action_noise(self.scaled(action, state), batch)  # (B, A)
+        return self.unscaled(noisy.clamp(-1, 1), state)
+
+    def one_hot_tasks(self, batch: dict[str, Any], batch_size: int) -> Tensor:
+        """One-hot task ids (B, N) from the batch's task strings, or from a single string for all of it.
+
+        A policy that knows one task performs it whatever the string: simulators name tasks in their own words.
+
+        Raises:
+            ValueError: A policy of several tasks is given no string, or one that it was not trained on.
+        """
+        known = self.config.known_tasks
+        given = batch.get(TASK) or [""] * batch_size  # lerobot-rollout gives "" when it was given none
+        if isinstance(given, str):
+            given = [given] * batch_size
+        names = [known[0]] * batch_size if len(known) == 1 else given
+        if "" in set(names) - set(known):
+            raise ValueError(
+                f"The batch has no '{TASK}' strings; this policy knows {len(known)} tasks: {known}. Give one of these "
+                "strings (--task for lerobot-rollout)."
+            )
+        check_tasks(self.config, names)
+        index = {task: i for i, task in enumerate(self.config.tasks)}
+        ids = torch.tensor([index[name] for name in names], device=self.state_scaling.offset.device)
+        return nn.functional.one_hot(ids, len(self.config.tasks)).float()
+
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """`select_action` as a chunk of one: (B, 1, A)."""
+        return self.select_action(batch, **kwargs)[:, None]
+
+
+def check_observation(config: PolicyConfig, batch: dict[str, Any]) -> None:
+    """Check what a policy is shown: each camera (B, C, H, W) in [0, 1], and vectors (B, N) such as `observation.state`.
+
+    Raises:
+        ValueError: A feature is missing or has another shape than in training, or images are not in [0, 1].
+    """
+    config.check_shapes(
+        {key: tuple(value.shape[1:]) for key, value in batch.items() if isinstance(value, Tensor)}
+    )
+    for key in config.cameras:
+        image = batch[key]
+        if not image.is_floating_point() or image.max() > _WHITE:
+            raise ValueError(
+                f"'{key}' is {image.dtype} with a maximum of {image.max().item():g}; expected floating-point numbers "
+                "in [0, 1]: divide a camera's bytes by 255, as prepare_observation_for_inference of "
+                "lerobot.policies.utils does."
+            )

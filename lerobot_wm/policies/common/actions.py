@@ -1,0 +1,92 @@
+"""How the heads of a policy learn actions: relative to the measured state, and with noise at test time."""
+
+import zlib
+from typing import Any
+
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from torch import Tensor, nn
+
+from lerobot_wm.constants import ACTION, OBS_STATE
+from lerobot_wm.data.tables import frame_values
+from lerobot_wm.policies.common.acting_config import ActingConfig
+from lerobot_wm.policies.common.features import Statistics, statistics
+from lerobot_wm.policies.common.names import recorded_name
+
+
+class RelativeToState(nn.Module):
+    """Actions minus the measured state, in the numbers of `ActingConfig.relative_indices`."""
+
+    of_action: Tensor
+    of_state: Tensor
+
+    def __init__(self, config: ActingConfig) -> None:
+        super().__init__()
+        self.register_buffer(
+            "of_action", torch.tensor(config.relative_indices, dtype=torch.long), persistent=False
+        )
+        self.register_buffer(
+            "of_state", torch.tensor(config.relative_state_indices, dtype=torch.long), persistent=False
+        )
+
+    def forward(self, action: Tensor, state: Tensor) -> Tensor:
+        """Actions (B, A) relative to proprioception (B, P) at the same frames."""
+        return self._add(action, state, -1)
+
+    def inverse(self, action: Tensor, state: Tensor) -> Tensor:
+        """Undo `forward`."""
+        return self._add(action, state, 1)
+
+    def _add(self, action: Tensor, state: Tensor, sign: int) -> Tensor:
+        if not len(self.of_action):
+            return action
+        return action.index_add(-1, self.of_action, state[..., self.of_state].to(action.dtype), alpha=sign)
+
+
+def action_range(
+    config: ActingConfig, stats: Statistics, dataset_meta: LeRobotDatasetMetadata
+) -> tuple[Tensor, Tensor]:
+    """Lowest and highest actions (A,) of a dataset, as the heads learn them."""
+    low, high = (value.clone() for value in statistics(stats, ACTION, "min", "max"))  # (A,)
+    chosen = config.relative_indices
+    if chosen:
+        action, state = (
+            frame_values(dataset_meta, key).view(-1, config.action_dim)
+            for key in (ACTION, recorded_name(OBS_STATE))
+        )  # (N, A)
+        relative = action[:, chosen] - state[:, chosen]  # (N, R)
+        low[chosen], high[chosen] = relative.amin(0), relative.amax(0)
+    return low, high
+
+
+class ActionNoise:
+    """Gaussian noise on actions, one stream per rollout of a batch, seeded by the rollout's first observation.
+
+    A rollout is therefore repeatable: it does not depend on the other rollouts, their order, or global random numbers.
+
+    Args:
+        std: Standard deviation, in the units in which the dataset's actions span [-1, 1].
+    """
+
+    def __init__(self, std: float) -> None:
+        self.std = std
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the streams: the next call begins new rollouts."""
+        self._streams: list[torch.Generator] = []
+
+    def __call__(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
+        """Add the next step's noise to scaled actions (B, A), given the batch of `select_action`."""
+        if len(self._streams) != action.shape[0]:
+            self._streams = [torch.Generator().manual_seed(_digest(batch, i)) for i in range(action.shape[0])]
+        noise = torch.stack([torch.randn(action.shape[1], generator=stream) for stream in self._streams])
+        return action + self.std * noise.to(action)
+
+
+def _digest(batch: dict[str, Any], i: int) -> int:
+    """A number made of every bit of the tensors of row i."""
+    digest = 0
+    for key in sorted(key for key, value in batch.items() if isinstance(value, Tensor) and value.ndim > 1):
+        digest = zlib.crc32(batch[key][i].contiguous().cpu().numpy().tobytes(), digest)
+    return digest
