@@ -69,7 +69,7 @@ def check_writable(folder: Path) -> None:
 
 
 @contextmanager
-def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> Iterator[None]:
+def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> Iterator[IO]:
     """Hold a lock on an output while it is written; the lock ends with the process, however that ends.
 
     The lock is a hidden file beside the output. Its last holder removes it.
@@ -78,6 +78,9 @@ def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> 
         output: A file or folder, which need not exist; its parent folder is created.
         job: One of several jobs that share the work: different jobs may write at the same time.
         wait: Wait for another writer instead of raising an error.
+
+    Yields:
+        The output's lock file. A subprocess that inherits it holds the lock too, even if this process is killed.
 
     Raises:
         BlockingIOError: Another process is writing the output.
@@ -91,21 +94,23 @@ def sole_writer(output: Path, job: str | None = None, *, wait: bool = False) -> 
     if job is not None:
         locks[f".{output.name}.{job}.lock"] = fcntl.LOCK_EX
     with ExitStack() as stack:
+        files = []
         for name, kind in locks.items():
+            operation = kind if wait else kind | fcntl.LOCK_NB
             try:
-                stack.enter_context(_locked(output.with_name(name), kind if wait else kind | fcntl.LOCK_NB))
+                files.append(stack.enter_context(_locked(output.with_name(name), operation)))
             except BlockingIOError as error:
                 raise BlockingIOError(
                     f"another process is writing {output}: wait for it, stop it, or choose another output."
                 ) from error
-        yield
+        yield files[0]
 
 
 @contextmanager
-def _locked(path: Path, operation: int) -> Iterator[None]:
+def _locked(path: Path, operation: int) -> Iterator[IO]:
     file = _lock(path, operation)
     try:
-        yield
+        yield file
     finally:
         # Only the last holder gets the exclusive lock, and removes the file.
         with file, suppress(OSError):
@@ -147,6 +152,6 @@ def new_folder(path: Path) -> Iterator[Path]:
     """
     with sole_writer(path):
         if path.exists():
-            raise FileExistsError(f"{path} already exists: choose another --output_root, or remove it.")
+            raise FileExistsError(f"{path} already exists: choose another output folder, or remove it.")
         with appears_whole(path) as temporary:
             yield temporary

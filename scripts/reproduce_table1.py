@@ -25,7 +25,7 @@ def main() -> None:
         subprocess.run(["bash", "scripts/setup.sh"], check=True)
         python = str(ROOT / ".venv" / "bin" / "python")
         os.execv(python, [python, __file__, *sys.argv[1:]])
-    from lerobot_wm.experiment.reproduce import main as reproduce
+    from lerobot_wm.experiment.experiment import main as reproduce
 
     reproduce()
 

@@ -1,21 +1,24 @@
-"""Some arms and seeds of a preset: what is finished, what is left, and running it."""
+"""`scripts/reproduce_table1.py`: some arms and seeds of a preset, from demonstrations to the table."""
 
+import argparse
 import shutil
+import signal
 import subprocess
+import sys
 from pathlib import Path
 from typing import IO
 
 from rich.console import Console
 from rich.table import Column, Table
 
-from lerobot_wm.constants import RECORDS_NAME, REPORTED_VARIATION_SET
+from lerobot_wm.constants import RECORDS_NAME, REPORTED_VARIATION_SET, VARIATION_SETS
 from lerobot_wm.experiment.plan import Plan
-from lerobot_wm.experiment.preset import Preset
+from lerobot_wm.experiment.preset import CONFIGS, Preset, load_preset, select_runs, write_settings
 from lerobot_wm.experiment.runner import Progress, Runner, Times, environment, minutes_left, minutes_text
 from lerobot_wm.experiment.stage import Stage, in_order, lerobot_wm, unfinished
-from lerobot_wm.files import write_whole
+from lerobot_wm.files import sole_writer, write_whole
 from lerobot_wm.records import Record, read_records, record_line
-from lerobot_wm.report.arms import Arm
+from lerobot_wm.report.arms import ARMS, Arm
 from lerobot_wm.system import usable_cores
 
 type Runs = dict[tuple[str, int | None], list[Record]]  # by (arm, seed)
@@ -24,86 +27,48 @@ type Runs = dict[tuple[str, int | None], list[Record]]  # by (arm, seed)
 class Ledger:
     """The records of an experiment by (arm, seed): committed ones, and those of its own rollouts.
 
-    It contains an arm and seed once all its rollouts are recorded, one on every variation of every task. Committed
-    records take precedence. Own ones are stored separately, so that another run can do without the committed ones.
+    An arm and seed is finished once all its rollouts are recorded, one on every variation of every task. Own records
+    are stored separately, so that another run can do without the committed ones. Records of other presets do not count.
 
     Args:
         path: File for all records; the own ones are beside it in `own_<name>`.
         committed: Records that count without the output folders of their runs.
         preset: Says which rollouts an arm and seed has.
-
-    Raises:
-        ValueError: A file holds something other than records, or records of another preset.
     """
 
     def __init__(self, path: Path, committed: Path, preset: Preset) -> None:
         self.path = path
         self._own_path = path.with_name(f"own_{path.name}")
-        self._preset = preset.name
-        self._rollouts = {(task, k) for task in preset.task_names for k in preset.variations}
-        self._committed = self._complete_runs(committed)
-        self._own = self._complete_runs(self._own_path)
-
-    def __contains__(self, run: tuple[str, int]) -> bool:
-        """Whether an arm and seed is finished."""
-        return run in self._committed or run in self._own
-
-    def is_committed(self, run: tuple[str, int]) -> bool:
-        """Whether the records of an arm and seed are committed."""
-        return run in self._committed
+        self._preset = preset
+        self.committed = self._finished_runs([committed])
+        self._own = self._finished_runs([self._own_path])
 
     @property
-    def empty(self) -> bool:
-        """Whether nothing is finished."""
-        return not self._committed and not self._own
+    def runs(self) -> Runs:
+        """All finished arms and seeds; committed records take precedence."""
+        return self._own | self.committed
 
-    def add(self, arm: str, seed: int, files: list[Path]) -> None:
-        """Add the rollouts of a finished arm and seed, unless they are recorded already.
-
-        Raises:
-            ValueError: The files hold other rollouts, or rollouts of another preset.
-        """
-        if (arm, seed) in self:
-            return
-        records = self._read(files)
-        if set(_by_run(records)) != {(arm, seed)} or not self._is_complete(records):
-            found = sorted({(record["arm"], record["seed"]) for record in records}, key=str)
-            raise ValueError(
-                f"{', '.join(map(str, files))}: {len(records)} rollouts of (arm, seed) {found}; expected the "
-                f"{len(self._rollouts)} of ('{arm}', {seed}). Remove their folders to roll out again."
-            )
-        self._own[arm, seed] = records
+    def add(self, files: list[Path]) -> None:
+        """Add the rollouts of an arm and seed."""
+        self._own |= self._finished_runs(files)
         _write(self._own_path, self._own)
 
     def write(self) -> None:
         """Write all records to one file."""
-        _write(self.path, self._own | self._committed)
+        _write(self.path, self.runs)
 
-    def _complete_runs(self, file: Path) -> Runs:
-        if not file.is_file() or not file.stat().st_size:
-            return {}
-        return {run: rows for run, rows in _by_run(self._read([file])).items() if self._is_complete(rows)}
-
-    def _read(self, files: list[Path]) -> list[Record]:
-        records = read_records(files)
-        others = {record["preset"] for record in records} - {self._preset}
-        if others:
-            raise ValueError(
-                f"{', '.join(map(str, files))}: rollouts of the preset {', '.join(sorted(map(str, others)))}; "
-                f"expected '{self._preset}'. Use another --output_dir or --results_dir."
-            )
-        return records
-
-    def _is_complete(self, records: list[Record]) -> bool:
-        return {(record["task"], record["variation"]) for record in records} == self._rollouts
-
-
-def _by_run(records: list[Record]) -> Runs:
-    """Records by (arm, seed), in order."""
-    runs: Runs = {}
-    for record in records:
-        runs.setdefault((record["arm"], record["seed"]), []).append(record)
-    return runs
+    def _finished_runs(self, files: list[Path]) -> Runs:
+        found = [file for file in files if file.is_file()]
+        runs: Runs = {}
+        for record in read_records(found) if found else []:
+            if record["preset"] == self._preset.name:
+                runs.setdefault((record["arm"], record["seed"]), []).append(record)
+        rollouts = {(task, k) for task in self._preset.task_names for k in self._preset.variations}
+        return {
+            run: records
+            for run, records in runs.items()
+            if {(record["task"], record["variation"]) for record in records} == rollouts
+        }
 
 
 def _write(path: Path, runs: Runs) -> None:
@@ -170,7 +135,7 @@ class Experiment:
 
     def _open_runs(self) -> list[tuple[Arm, int]]:
         """The arms and seeds whose records are incomplete."""
-        return [(arm, seed) for arm, seed in self.runs if (arm.name, seed) not in self.ledger]
+        return [(arm, seed) for arm, seed in self.runs if (arm.name, seed) not in self.ledger.runs]
 
     def _targets(self) -> list[Stage]:
         """The last stages of all that is not recorded yet."""
@@ -184,14 +149,14 @@ class Experiment:
         for arm, seed in self._open_runs():
             stages = self.plan.evaluations(arm, seed)
             if all(stage.is_finished for stage in stages):
-                self.ledger.add(arm.name, seed, [stage.folder / RECORDS_NAME for stage in stages])
+                self.ledger.add([stage.folder / RECORDS_NAME for stage in stages])
 
     def show(self, console: Console) -> None:
         """Print every stage and its state; writes nothing."""
         todo = unfinished(self._targets())
         table = Table(Column("stage", overflow="fold"), "state", "minutes", box=None)
         for arm, seed in self.runs:
-            if (arm.name, seed) in self.ledger:
+            if (arm.name, seed) in self.ledger.runs:
                 table.add_row(f"{arm.name}, seed {seed}", "records complete", "")
         for name, stage in in_order(self._targets()).items():
             if name in todo:
@@ -209,9 +174,7 @@ class Experiment:
 
         Otherwise a user who has changed settings would take these records for new ones.
         """
-        taken = [
-            f"{arm.name} {seed}" for arm, seed in self.runs if self.ledger.is_committed((arm.name, seed))
-        ]
+        taken = [f"{arm.name} {seed}" for arm, seed in self.runs if (arm.name, seed) in self.ledger.committed]
         if taken:
             console.print(
                 f"Records taken from {self._committed}, not run: {', '.join(taken)} (arm and seed). "
@@ -240,10 +203,95 @@ class Experiment:
 
     def report(self) -> bool:
         """Write the records and the report if anything is finished, and return whether that succeeded."""
-        if self.ledger.empty:
+        if not self.ledger.runs:
             return True
         self.ledger.write()
         # It is cheap to write, so it always shows the latest records.
         shutil.rmtree(self.report_dir, ignore_errors=True)
         command = report_command(self.plan, self.runs, self.ledger.path, self.report_dir)
         return subprocess.run(command, env=environment(usable_cores())).returncode == 0
+
+
+# Lines of a failed stage's log that are shown.
+LOG_TAIL = 15
+
+
+def show_failures(failed: list[Stage], console: Console) -> None:
+    """Print the name of each failed stage and the end of its log."""
+    for stage in failed:
+        lines = stage.log.read_text(errors="replace").splitlines()[-LOG_TAIL:]
+        console.print(f"\n[red]{stage.name} failed.[/] The end of {stage.log}:", highlight=False)
+        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Define the command line."""
+    parser = argparse.ArgumentParser(
+        description="Table 1 of the paper with controls: any arms and seeds, from demonstrations to the report. "
+        "You can stop it and run it again: finished stages are not repeated, training resumes from its last "
+        "checkpoint, and an arm and seed whose records are complete does not run.",
+        epilog=f"Arms: {', '.join(ARMS)}.",
+    )
+    presets = sorted(file.stem for file in CONFIGS.glob("*.json"))
+    parser.add_argument("--preset", required=True, choices=presets, help="NAME of configs/NAME.json")
+    parser.add_argument("--arms", default="", help="names separated by commas; the preset's by default")
+    parser.add_argument(
+        "--seeds", default="", help="training seeds separated by commas; the preset's by default"
+    )
+    parser.add_argument("--output_dir", type=Path, help="outputs/PRESET by default")
+    parser.add_argument("--results_dir", type=Path, help="committed records; results/PRESET by default")
+    parser.add_argument(
+        "--processes",
+        type=int,
+        default=usable_cores(),
+        help="how many stages run side by side (%(default)s)",
+    )
+    parser.add_argument(
+        "--variation_set",
+        type=int,
+        choices=VARIATION_SETS,
+        default=REPORTED_VARIATION_SET,
+        help="variations to roll out on: 42 to report, 43 to tune, 44 to confirm; recorded in separate files "
+        "(%(default)s)",
+    )
+    parser.add_argument(
+        "--quality", action="store_true", help="also measure the world model's quality (lerobot-wm quality)"
+    )
+    parser.add_argument("--list", action="store_true", help="only print the stages and their state")
+    return parser
+
+
+def main() -> None:
+    """Entry point of `scripts/reproduce_table1.py`."""
+    args = make_parser().parse_args()
+    console = Console()
+    try:
+        preset = load_preset(args.preset)
+        runs = select_runs(preset, _names(args.arms), [int(seed) for seed in _names(args.seeds)])
+        output_dir = args.output_dir or Path("outputs") / preset.name
+        results_dir = args.results_dir or Path("results") / preset.name
+        plan = Plan(preset, output_dir, args.variation_set)
+        if args.list:
+            Experiment(plan, runs, results_dir, args.processes, args.quality).show(console)
+            return
+        # Stop as on Ctrl-C.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with sole_writer(output_dir) as lock:
+            write_settings(preset, output_dir)
+            experiment = Experiment(plan, runs, results_dir, args.processes, args.quality)
+            experiment.name_committed(console)
+            failed = experiment.run(lock, console)
+            reported = experiment.report()
+    except (ValueError, OSError) as error:
+        sys.exit(f"reproduce_table1: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\nStopped. Run the same command again to resume.")
+    show_failures(failed, console)
+    if failed:
+        sys.exit(f"{len(failed)} stages failed. Run the same command to try them again.")
+    if not reported:
+        sys.exit("The report failed for the reason above. The records are complete.")
+
+
+def _names(comma_separated: str) -> list[str]:
+    return [name.strip() for name in comma_separated.split(",") if name.strip()]

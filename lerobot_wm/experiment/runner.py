@@ -1,14 +1,12 @@
 """Running stages side by side: the longest chains first, within the machine's cores."""
 
-import fcntl
 import json
 import os
 import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -41,17 +39,9 @@ class Times:
         write_whole(self._path, json.dumps(self._measured, indent=1) + "\n")
 
     def minutes(self, kind: str) -> float:
-        """How long a stage of this kind takes: the mean of those measured, else what the preset says.
-
-        Raises:
-            ValueError: None was measured and the preset has no entry.
-        """
+        """How long a stage of this kind takes: the mean of those measured, else what the preset says."""
         seconds = [entry["seconds"] for entry in self._measured.values() if entry["kind"] == kind]
-        if seconds:
-            return sum(seconds) / len(seconds) / 60
-        if kind not in self._expected:
-            raise ValueError(f"The preset has no 'minutes' of '{kind}': add an estimate.")
-        return self._expected[kind]
+        return sum(seconds) / len(seconds) / 60 if seconds else self._expected[kind]
 
 
 def ranks(stages: Mapping[str, Stage], minutes: Mapping[str, float]) -> dict[str, float]:
@@ -79,25 +69,6 @@ def minutes_left(stages: Mapping[str, Stage], minutes: Mapping[str, float], proc
     return max(longest, sum(minutes[name] for name in stages) / processes)
 
 
-@contextmanager
-def hold_lock(output_dir: Path) -> Iterator[IO]:
-    """Hold a folder's lock, which its running stages hold too.
-
-    Raises:
-        BlockingIOError: Another run, or a stage that a killed run left behind, still writes there.
-    """
-    output_dir.mkdir(parents=True, exist_ok=True)
-    with (output_dir / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BlockingIOError(
-                f"Another run, or a stage that a killed run left behind, still writes to {output_dir}: wait until it "
-                "has ended, stop it, or use another --output_dir."
-            ) from error
-        yield lock
-
-
 # From SIGTERM to SIGKILL.
 STOP_SECONDS = 20.0
 
@@ -115,13 +86,13 @@ class StageProcess:
     def __init__(self, stage: Stage, cores: int, lock: IO) -> None:
         self.stage = stage
         self.resumed = stage.is_resumable
-        self._started = time.monotonic()
+        self.started = time.monotonic()
         command = stage.command(cores)
         stage.prepare()
         with stage.log.open("a") as log:
             print("$", shlex.join(command), file=log, flush=True)
             # In its own process group: Ctrl-C reaches only this process, which then stops the group.
-            self._process = subprocess.Popen(
+            self.process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -132,27 +103,14 @@ class StageProcess:
             )
 
     @property
-    def returncode(self) -> int | None:
-        """Its exit code; None while it runs."""
-        return self._process.poll()
-
-    @property
     def seconds(self) -> float:
         """Since its start."""
-        return time.monotonic() - self._started
+        return time.monotonic() - self.started
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal to all its processes."""
-        if self.returncode is None:
-            os.killpg(self._process.pid, number)
-
-    def wait(self, seconds: float | None = None) -> None:
-        """Wait until it has ended.
-
-        Raises:
-            subprocess.TimeoutExpired: It is still running.
-        """
-        self._process.wait(seconds)
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, number)
 
 
 def stop(running: Sequence[StageProcess]) -> None:
@@ -162,10 +120,10 @@ def stop(running: Sequence[StageProcess]) -> None:
     end = time.monotonic() + STOP_SECONDS
     for work in running:
         try:
-            work.wait(max(0.0, end - time.monotonic()))
+            work.process.wait(max(0.0, end - time.monotonic()))
         except subprocess.TimeoutExpired:
             work.signal(signal.SIGKILL)
-            work.wait()
+            work.process.wait()
 
 
 def environment(cores: int) -> dict[str, str]:
@@ -245,9 +203,6 @@ class Runner:
         times: Measured and expected wall times.
         progress: Shows the progress.
         on_finish: Called after each stage that succeeds.
-
-    Raises:
-        ValueError: There are no minutes for a kind of stage.
     """
 
     def __init__(
@@ -304,14 +259,15 @@ class Runner:
 
     def _reap(self) -> None:
         for work in list(self._running):
-            if work.returncode is None:
+            returncode = work.process.poll()
+            if returncode is None:
                 continue
             self._running.remove(work)
-            if work.returncode == 0 and work.stage.is_finished:
+            if returncode == 0 and work.stage.is_finished:
                 if not work.resumed:
                     self._times.record(work.stage, work.seconds)
                 self._progress.finished(work.stage, work.seconds)
                 self._on_finish(work.stage)
             else:
                 self._failed.append(work.stage)
-                self._progress.failed(work.stage, work.returncode)
+                self._progress.failed(work.stage, returncode)
