@@ -43,20 +43,6 @@ class ExpertConfig:
     # Processes; each takes whole tasks.
     num_workers: int = 2
 
-    def validate(self) -> None:
-        """Check the flags.
-
-        Raises:
-            ValueError: A flag has an invalid value.
-        """
-        resolve_tasks(self.tasks)
-        check_variation_set(self.variation_set)
-        parse_variations(self.variations)
-        if not 1 <= self.episode_length <= MAX_EPISODE_STEPS:
-            raise ValueError(f"episode_length is {self.episode_length}; expected 1 to {MAX_EPISODE_STEPS}.")
-        if self.num_workers < 1:
-            raise ValueError(f"--num_workers={self.num_workers}: expected at least 1.")
-
     @property
     def records_file(self) -> Path:
         """The records file to write."""
@@ -67,30 +53,33 @@ def roll_out_expert(cfg: ExpertConfig) -> list[Record]:
     """Roll out the experts and write their records, as `lerobot-wm eval` does for a policy.
 
     Raises:
-        ValueError: See `ExpertConfig.validate`.
+        ValueError: There is no such task, variation or set of variations.
         FileExistsError, BlockingIOError: See `new_records`.
     """
-    cfg.validate()
-    tasks = resolve_tasks(cfg.tasks)
+    tasks, variations = resolve_tasks(cfg.tasks), parse_variations(cfg.variations)
+    check_variation_set(cfg.variation_set)
     with new_records(cfg.records_file):
-        progress = tqdm(_rollouts(cfg, tasks), total=len(tasks), desc="Rolling out", unit="task")
+        progress = tqdm(_rollouts(cfg, tasks, variations), total=len(tasks), desc="Rolling out", unit="task")
         records = [record for task_records in progress for record in task_records]
         write_whole(cfg.records_file, "".join(map(record_line, records)))
     return records
 
 
-def _rollouts(cfg: ExpertConfig, tasks: tuple[str, ...]) -> Iterator[list[Record]]:
+def _rollouts(
+    cfg: ExpertConfig, tasks: tuple[str, ...], variations: tuple[int, ...]
+) -> Iterator[list[Record]]:
     """Records task by task, in the order of `tasks`."""
-    if cfg.num_workers == 1:
+    roll_out = partial(_roll_out, cfg, variations)
+    if cfg.num_workers <= 1:
         with quiet():
-            yield from map(partial(_roll_out, cfg), tasks)
+            yield from map(roll_out, tasks)
         return
-    yield from map_in_workers(partial(_roll_out, cfg), tasks, min(cfg.num_workers, len(tasks)), silence)
+    yield from map_in_workers(roll_out, tasks, min(cfg.num_workers, len(tasks)), silence)
 
 
-def _roll_out(cfg: ExpertConfig, task: str) -> list[Record]:
+def _roll_out(cfg: ExpertConfig, variations: tuple[int, ...], task: str) -> list[Record]:
     simulation = Simulation(task, cfg.variation_set)
-    return [_record(cfg, simulation, variation) for variation in parse_variations(cfg.variations)]
+    return [_record(cfg, simulation, variation) for variation in variations]
 
 
 def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record:

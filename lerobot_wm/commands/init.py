@@ -13,7 +13,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.files import appears_whole, sole_writer
+from lerobot_wm.files import new_folder
 
 
 @dataclass
@@ -45,21 +45,13 @@ def initialise(cfg: InitConfig) -> Path:
         ValueError: The policy does not fit the dataset.
     """
     folder = cfg.output_dir / PRETRAINED_MODEL_DIR
-    with sole_writer(folder):
-        if folder.exists():
-            raise FileExistsError(f"{folder} already exists: choose another --output_dir, or remove it.")
-        _write(cfg, folder)
-    return folder
-
-
-def _write(cfg: InitConfig, folder: Path) -> None:
-    meta = cfg.dataset.metadata()
-    set_seed(cfg.seed)
-    policy = make_policy(cfg.policy, ds_meta=meta)
-    with appears_whole(folder) as temporary:
-        policy.save_pretrained(temporary)
+    with new_folder(folder) as temporary:
+        meta = cfg.dataset.metadata()
+        set_seed(cfg.seed)
+        make_policy(cfg.policy, ds_meta=meta).save_pretrained(temporary)
         for processor in make_pre_post_processors(cfg.policy, dataset_stats=meta.stats):
             processor.save_pretrained(temporary)
+    return folder
 
 
 def main() -> None:

@@ -9,11 +9,9 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
-from copy import deepcopy
 
 import torch
 from lerobot.configs import parser
-from lerobot.policies import make_policy
 from lerobot.utils.utils import init_logging
 from rich.console import Console
 from tqdm import tqdm
@@ -24,11 +22,11 @@ from lerobot_wm.evaluate.rollouts import TaskRunner, task_names
 from lerobot_wm.evaluate.wandb_log import log_evaluation, wandb_run
 from lerobot_wm.files import appears_whole
 from lerobot_wm.policies.common.checkpoint import open_checkpoint
-from lerobot_wm.policies.common.config import PolicyConfig
 from lerobot_wm.records import (
     Record,
     is_in_split,
     new_records,
+    present_splits,
     provenance,
     record_line,
     summarize_success,
@@ -54,7 +52,7 @@ def _run_in_worker(task: str) -> list[Record]:
 
 def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
     """Records task by task, in the order of `tasks`; with one process, the policy is loaded when this returns."""
-    if cfg.num_workers == 1:
+    if cfg.num_workers <= 1:
         return map(TaskRunner(cfg).run, tasks)
     workers = min(cfg.num_workers, len(tasks))
     threads = max(1, usable_cores() // workers)
@@ -75,21 +73,14 @@ def evaluate(cfg: EvaluateConfig) -> list[Record]:
         ValueError, FileNotFoundError: The checkpoint is damaged or incomplete, or its processors name other code.
     """
     cfg.validate()
+    path, revision = cfg.policy.pretrained_path, cfg.policy.pretrained_revision
     with new_records(cfg.records_file):
-        return _evaluate(cfg)
-
-
-def _evaluate(cfg: EvaluateConfig) -> list[Record]:
-    open_checkpoint(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
-    if isinstance(cfg.policy, PolicyConfig):
-        # These are small: a damaged one is found before environments are built.
-        make_policy(deepcopy(cfg.policy), env_cfg=cfg.env, rename_map=cfg.rename_map)
-    tasks = task_names(cfg)
-    revision = cfg.policy.pretrained_revision
-    with wandb_run(cfg.wandb, cfg.policy.pretrained_path, cfg.output_dir, revision) as run:
-        records = _write_records(cfg, tasks)
-        if run is not None:
-            log_evaluation(run, cfg.arm_name, records)
+        open_checkpoint(path, revision)
+        tasks = task_names(cfg)
+        with wandb_run(cfg.wandb, path, cfg.output_dir, revision) as run:
+            records = _write_records(cfg, tasks)
+            if run is not None:
+                log_evaluation(run, cfg.arm_name, records)
     return records
 
 
@@ -118,17 +109,17 @@ def _write_records(cfg: EvaluateConfig, tasks: list[str]) -> list[Record]:
 
 def _write_info(cfg: EvaluateConfig, records: list[Record], seconds: float) -> None:
     """Write eval_info.json: success rates with intervals per task, split and overall, and their provenance."""
-
-    def chosen(split: str) -> list[Record]:
-        return [record for record in records if is_in_split(record, split)]
-
     tasks = dict.fromkeys(record["task"] for record in records)
     info = {
         "arm": cfg.arm_name,
         "policy_path": str(cfg.policy.pretrained_path),
         "per_task": {task: summarize_success(r for r in records if r["task"] == task) for task in tasks},
-        **{split: summarize_success(chosen(split)) for split in ("seen", "unseen") if chosen(split)},
-        "overall": summarize_success(records),
+        **{
+            "overall" if split == "all" else split: summarize_success(
+                r for r in records if is_in_split(r, split)
+            )
+            for split in present_splits(records)
+        },
         "eval_s": seconds,
         "provenance": provenance(),
     }

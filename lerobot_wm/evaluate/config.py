@@ -48,30 +48,21 @@ class EvaluateConfig(EvalPipelineConfig):
         """Check the flags before anything is loaded.
 
         Raises:
-            ValueError: There is no policy or no seed, a rollout would run twice, a flag is not supported here, or the
-                policy was not trained for the environment.
+            ValueError: There is no trained policy, a rollout would run twice, a flag has no effect here, or the policy
+                was not trained for the environment.
         """
-        if self.policy is None:
-            raise ValueError("No policy: give --policy.path=CHECKPOINT_FOLDER_OR_HUB_ID.")
-        if self.seed is None:
-            raise ValueError("--seed=null: each rollout needs a seed. Give the first one, such as --seed=0.")
-        if self.num_workers < 1:
-            raise ValueError(f"--num_workers={self.num_workers}: expected at least 1.")
-        if self.eval.recording:
-            raise ValueError("--eval.recording=true is not supported: use `lerobot-eval` to record datasets.")
-        if isinstance(self.policy, LatentPolicyConfig) and self.policy.save_predicted_video:
+        if self.policy is None or self.policy.pretrained_path is None:
+            raise ValueError("No trained policy: give --policy.path=CHECKPOINT_FOLDER_OR_HUB_ID.")
+        films_predictions = isinstance(self.policy, LatentPolicyConfig) and self.policy.save_predicted_video
+        if self.eval.recording or films_predictions:
             raise ValueError(
-                "--policy.save_predicted_video=true is not supported: use `lerobot-eval` for videos of predictions."
+                "--eval.recording and --policy.save_predicted_video have no effect here: use `lerobot-eval`."
             )
         n_variations = len({variation_of(self.env, seed) for seed in self.seeds})
         if n_variations < self.eval.n_episodes:
             raise ValueError(
                 f"--eval.n_episodes={self.eval.n_episodes}, but there are only {n_variations} variations: "
                 f"use --eval.n_episodes={n_variations}."
-            )
-        if self.policy.pretrained_path is None:
-            raise ValueError(
-                f"--policy.type={self.policy.type} is an untrained policy: give --policy.path=CHECKPOINT."
             )
         check_fit(self.policy, self.env, self.rename_map)
 

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-def training_config(policy_path: Path | None, revision: str | None = None) -> dict[str, Any]:
+def training_config(policy_path: Path, revision: str | None = None) -> dict[str, Any]:
     """Settings of the run that trained a checkpoint (folder or Hub id); empty if the checkpoint lacks them."""
     try:
-        file = None if policy_path is None else checkpoint_file(policy_path, TRAIN_CONFIG_NAME, revision)
+        file = checkpoint_file(policy_path, TRAIN_CONFIG_NAME, revision)
     except LocalEntryNotFoundError:  # offline, with a cached checkpoint
         logger.warning(
             "%s of %s is not on this machine, and the Hub is unreachable.", TRAIN_CONFIG_NAME, policy_path
@@ -37,7 +37,7 @@ def training_config(policy_path: Path | None, revision: str | None = None) -> di
 
 @contextmanager
 def wandb_run(
-    cfg: WandBConfig, policy_path: Path | None, folder: Path, revision: str | None = None
+    cfg: WandBConfig, policy_path: Path, folder: Path, revision: str | None = None
 ) -> Iterator["wandb.Run | None"]:
     """Open the wandb run that trained a checkpoint, or a new one if that training did not log to wandb.
 
@@ -49,10 +49,6 @@ def wandb_run(
 
     Yields:
         The run; None without `--wandb.enable=true`.
-
-    Raises:
-        ImportError: wandb is not installed.
-        RuntimeError: wandb opens no run: there is no login, no network, or no such mode.
     """
     if not cfg.enable:
         yield None
@@ -63,21 +59,16 @@ def wandb_run(
     trained = WandBConfig(**training_config(policy_path, revision).get("wandb", {}))
     chosen = trained if trained.run_id is not None and cfg.run_id is None else cfg
     folder.mkdir(parents=True, exist_ok=True)
-    try:
-        run = wandb.init(
-            project=chosen.project,
-            entity=chosen.entity,
-            id=chosen.run_id,
-            resume="allow",
-            mode=cfg.mode or chosen.mode,
-            dir=folder,
-            # As in LeRobot's training.
-            settings=wandb.Settings(silent=True),
-        )
-    except (wandb.Error, ValueError) as error:
-        raise RuntimeError(
-            f"cannot open a wandb run ({error}): log in with `wandb login`, or give --wandb.mode=offline."
-        ) from error
+    run = wandb.init(
+        project=chosen.project,
+        entity=chosen.entity,
+        id=chosen.run_id,
+        resume="allow",
+        mode=cfg.mode or chosen.mode,
+        dir=folder,
+        # As in LeRobot's training.
+        settings=wandb.Settings(silent=True),
+    )
     print(f"wandb: {run.settings.sync_dir if run.offline else run.url}")
     try:
         yield run
