@@ -186,15 +186,11 @@ def check_can_push(repo_id: str) -> None:
     """Check that the user may push to a repository, before work is done whose result would be refused.
 
     Raises:
-        HubRefusalError: There is no token, or the token cannot write to the repository's namespace.
-        HfHubHTTPError, ConnectionError: The Hub refuses the token, or cannot be reached.
+        HubRefusalError: The token cannot write to the repository's namespace.
+        LocalTokenNotFoundError, HfHubHTTPError, ConnectionError: There is no token, the Hub refuses it, or cannot be
+            reached.
     """
-    try:
-        user = whoami()
-    except LocalTokenNotFoundError as error:
-        raise HubRefusalError(
-            f"pushing to {repo_id} needs a token with write access, and there is no token: {LOGIN}."
-        ) from error
+    user = whoami()
     if user["auth"].get("accessToken", {}).get("role") == "read":
         raise HubRefusalError(
             f"pushing to {repo_id} needs a token with write access, but the token of {user['name']} is read-only: "

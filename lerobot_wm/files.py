@@ -6,10 +6,12 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
+
+from tqdm import tqdm
 
 logger = logging.getLogger(__name__)
 
@@ -155,3 +157,19 @@ def new_folder(path: Path) -> Iterator[Path]:
             raise FileExistsError(f"{path} already exists: choose another output folder, or remove it.")
         with appears_whole(path) as temporary:
             yield temporary
+
+
+def copy_dataset(root: Path, folder: Path, new_name: Callable[[str], str] = str) -> None:
+    """Copy the files of a LeRobotDataset, with a progress bar.
+
+    Args:
+        root: The dataset's folder.
+        folder: Folder of the copy.
+        new_name: Gives a file's path in the copy, from its path in the dataset.
+    """
+    parts = ("meta", "data", "videos")
+    files = [path for part in parts for path in (root / part).rglob("*") if path.is_file()]
+    for path in tqdm(files, desc="Copying", unit="file"):
+        copy = folder / new_name(path.relative_to(root).as_posix())
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, copy)

@@ -98,35 +98,31 @@ def read_records(paths: Iterable[Path]) -> list[Record]:
             variations of different sets would be compared.
     """
     records: list[Record] = []
-    # Where each fact was first read: what must agree -> (value, place).
-    first_read: dict[tuple, tuple[Any, str]] = {}
+    rollouts: dict[tuple, str] = {}  # -> the place of its record
+    shared: dict[tuple, tuple[Any, str]] = {}  # what records must agree in -> its first value, and where
     for path in paths:
         for number, line in enumerate(_read_lines(path), start=1):
             place = f"{path}:{number}"
             record = _parse(line, place)
             rollout = (record["arm"], record["seed"], record["task"], record["variation"])
-            _, first_place = first_read.setdefault(rollout, (True, place))
-            if first_place != place:
+            if rollout in rollouts:
                 raise ValueError(
-                    f"{place} repeats the rollout (arm, seed, task, variation) = {rollout} of {first_place}. Give each "
-                    "run once, and evaluate different runs under different --arm names."
+                    f"{place} repeats the rollout (arm, seed, task, variation) = {rollout} of {rollouts[rollout]}. "
+                    "Give each run once, and evaluate different runs under different --arm names."
                 )
-            preset, first_place = first_read.setdefault(("preset", record["arm"]), (record["preset"], place))
-            if preset != record["preset"]:
-                raise ValueError(
-                    f"{place}: arm '{record['arm']}' has preset '{record['preset']}', but '{preset}' at {first_place}. "
-                    "The seeds of an arm are pooled: report each preset by itself, or evaluate under another --arm."
-                )
-            for key in ("seen", "variation_set"):
-                if key not in record:
+            rollouts[rollout] = place
+            arm, _, *variation = rollout
+            facts: dict[str, Any] = dict(record)
+            for key, owner in (("preset", [arm]), ("seen", variation), ("variation_set", variation)):
+                if key not in facts:
                     continue
-                position = (key, record["task"], record["variation"])
-                value, first_place = first_read.setdefault(position, (record[key], place))
-                if value != record[key]:
+                value = facts[key]
+                first, first_place = shared.setdefault((key, *owner), (value, place))
+                if value != first:
                     raise ValueError(
-                        f"{place}: variation {record['variation']} of {record['task']} has {key} {record[key]}, but "
-                        f"{value} at {first_place}. These are different variation sets (--env.variation_set), which "
-                        "cannot be compared: report each set by itself."
+                        f"{place}: {key} of {owner} is {value!r}, but {first!r} at {first_place}. The seeds of an arm "
+                        "share one preset, and arms are compared on one variation set (--env.variation_set): report "
+                        "the others separately."
                     )
             records.append(record)
     if not records:
@@ -141,13 +137,14 @@ def _read_lines(path: Path) -> list[str]:
 
 def _parse(line: str, place: str) -> Record:
     try:
-        record: Record = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{place} is not JSON ({error}): expected one record per line.") from error
+        record = json.loads(line)
+    except json.JSONDecodeError:
+        record = None
     expected = Record.__required_keys__
     if not isinstance(record, dict) or set(record) - Record.__optional_keys__ != expected:
-        found = sorted(record) if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f"{place} is not a record: found {found}, expected the keys {sorted(expected)}.")
+        raise ValueError(
+            f"{place} is not a record: found {line[:80]!r}, expected JSON with the keys {sorted(expected)}."
+        )
     return cast(Record, record)
 
 

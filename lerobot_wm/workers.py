@@ -150,16 +150,7 @@ class Job:
         return f"{self.index}-of-{self.count}"
 
     def select[T](self, pieces: Sequence[T]) -> list[T]:
-        """The pieces of work of this job: every n-th one, so that each job gets some of every task.
-
-        Raises:
-            ValueError: There are fewer pieces than jobs.
-        """
-        if len(pieces) < self.count:
-            raise ValueError(
-                f"shard is {self.index}/{self.count}, but this work has only {len(pieces)} parts: "
-                f"start at most {len(pieces)} jobs."
-            )
+        """The pieces of work of this job: every n-th one, so that each job gets some of every task."""
         return list(pieces[self.index - 1 :: self.count])
 
 

@@ -223,7 +223,7 @@ def one_shard(folder: Path, **changes: object) -> ShardRecord:
     }
     shard = Shard(**{**settings, **changes})
     with quiet():
-        write_shard(shard, folder, on_episode=lambda: None)
+        write_shard(shard, folder)
     return ShardRecord.load(folder / shard.name)
 
 
@@ -248,8 +248,9 @@ def test_variations_argument() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"noise": -0.1}, {"episodes_per_task": 0}, {"tasks": "reach"}, {"camera_name": "top"}]
+    ("change", "named"), [({"tasks": "reach"}, "reach-v3"), ({"camera_name": "top"}, "topview")]
 )
-def test_bad_settings_are_refused_before_work(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=r"expected|did you mean"):
-        CollectConfig(repo_id="user/x", **change)
+def test_unknown_names_are_refused_before_work(change: dict[str, str], named: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=named):
+        collect(CollectConfig(repo_id="user/x", root=tmp_path / "dataset", **change))
+    assert not any(tmp_path.iterdir())

@@ -2,14 +2,11 @@
 
 import json
 import logging
-import multiprocessing
 import shutil
-import sys
 import time
 from collections import Counter, defaultdict
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from dataclasses import asdict
-from multiprocessing.queues import SimpleQueue
+from functools import partial
 from pathlib import Path
 
 import draccus
@@ -25,17 +22,10 @@ from lerobot_wm.collect.merge import merge_datasets
 from lerobot_wm.collect.shards import Shard, ShardRecord, versions, write_shard
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.envs.tasks import expert_name
-from lerobot_wm.errors import cache_folders, check_can_push, errors_as_lines
+from lerobot_wm.errors import cache_folders, check_can_push
 from lerobot_wm.files import UNFINISHED, appears_whole, check_writable, sole_writer
 from lerobot_wm.system import quiet, silence
-from lerobot_wm.workers import (
-    Job,
-    check_same_settings,
-    delay_interrupts,
-    end_with_parent,
-    shards_folder,
-    workers_interrupted,
-)
+from lerobot_wm.workers import Job, check_same_settings, map_in_workers, shards_folder
 
 
 def collect(config: CollectConfig) -> Path:
@@ -51,7 +41,7 @@ def collect(config: CollectConfig) -> Path:
     Raises:
         FileExistsError: The folder has anything but this very dataset, or shards with other settings.
         BlockingIOError: Another process is collecting this dataset, or this job's part of it.
-        ValueError: There are more jobs than shards, or a shard is incomplete.
+        ValueError: A flag names nothing that exists, or a shard is incomplete.
     """
     job = Job.parse(config.shard) if config.shard else None
     with sole_writer(config.output_root, job.lock_name if job else None):
@@ -125,52 +115,14 @@ def _count_finished(shards: list[Shard], folder: Path) -> int:
 def write_missing_shards(shards: list[Shard], folder: Path, num_workers: int) -> None:
     """Write the shards that are not in `folder` yet, with a progress bar over all episodes."""
     missing = [shard for shard in shards if not (folder / shard.name).exists()]
+    write = partial(write_shard, folder=folder)
+    workers = min(num_workers, len(missing))
+    written = map(write, missing) if workers <= 1 else map_in_workers(write, missing, workers, silence)
     total = sum(shard.count for shard in shards)
     done = total - sum(shard.count for shard in missing)
     with tqdm(total=total, initial=done, unit="episode", desc="collecting") as bar:
-        if num_workers == 1 or len(missing) <= 1:
-            for shard in missing:
-                write_shard(shard, folder, on_episode=bar.update)
-        else:
-            _write_in_parallel(missing, folder, min(num_workers, len(missing)), bar)
-
-
-def _write_in_parallel(shards: list[Shard], folder: Path, num_workers: int, bar: tqdm) -> None:
-    # Workers are forked from a server that imports LeRobot once and has neither threads nor OpenGL.
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["lerobot_wm.collect.command"])
-    saved = context.SimpleQueue()
-    with (
-        ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(saved,)) as pool,
-        workers_interrupted(),
-    ):
-        with delay_interrupts():
-            pending = {pool.submit(_write_in_worker, shard, folder) for shard in shards}
-        while pending:
-            done, pending = wait(pending, timeout=0.2, return_when=FIRST_EXCEPTION)
-            while not saved.empty():
-                saved.get()
-                bar.update()
-            if any(future.exception() is not None for future in done):
-                pool.shutdown(cancel_futures=True)
-            for future in done:
-                future.result()
-
-
-# In a worker: receives one item for each saved episode.
-_episodes_saved: "SimpleQueue[None]"
-
-
-def _start_worker(saved: "SimpleQueue[None]") -> None:
-    global _episodes_saved
-    _episodes_saved = saved
-    end_with_parent()
-    silence()
-
-
-def _write_in_worker(shard: Shard, folder: Path) -> None:
-    with errors_as_lines():
-        write_shard(shard, folder, on_episode=lambda: _episodes_saved.put(None))
+        for count in written:
+            bar.update(count)
 
 
 def _write_record(root: Path, config: CollectConfig, records: list[ShardRecord], seconds: float) -> None:
@@ -234,11 +186,7 @@ def push(config: CollectConfig) -> None:
 def main() -> None:
     """Entry point of `lerobot-wm collect`."""
     logging.basicConfig(level=logging.WARNING)
-    try:
-        config = draccus.parse(CollectConfig, args=sys.argv[1:])
-    except draccus.ParsingError as error:
-        # The error of CollectConfig is the cause.
-        sys.exit(f"lerobot-wm collect: {error} {error.__cause__ or ''}")
+    config = draccus.parse(CollectConfig)
     if config.push_to_hub:
         check_can_push(config.repo_id)
     collect(config)

@@ -8,11 +8,10 @@ from huggingface_hub.utils import validate_repo_id
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_wm.collect.shards import SHARD_EPISODES, Shard
-from lerobot_wm.constants import CAMERA_NAME, IMAGE_SIZE, MAX_EPISODE_STEPS, REPORTED_VARIATION_SET
+from lerobot_wm.constants import CAMERA_NAME, IMAGE_SIZE, REPORTED_VARIATION_SET
 from lerobot_wm.envs.cameras import parse_cameras
 from lerobot_wm.envs.tasks import resolve_tasks, tasks_of_one_description
 from lerobot_wm.envs.variations import check_variation_set, parse_variations
-from lerobot_wm.workers import Job
 
 
 @dataclass
@@ -56,35 +55,9 @@ class CollectConfig:
     license: str = "apache-2.0"
 
     def __post_init__(self) -> None:
-        """Check every field."""
+        """Check a name that becomes a folder."""
         if self.root is None:
             validate_repo_id(self.repo_id)
-        tasks = resolve_tasks(self.tasks)
-        for description, (first, *others) in tasks_of_one_description(tasks).items():
-            kept = ",".join(task for task in tasks if task not in others)
-            raise ValueError(
-                f"{first} and {', '.join(others)} have one description, {description!r}, and would become one task of "
-                f"the dataset. Collect {', '.join(others)} into another dataset, and here --tasks={kept}."
-            )
-        parse_variations(self.variations)
-        check_variation_set(self.variation_set)
-        parse_cameras(self.camera_name)
-        if self.shard is not None:
-            Job.parse(self.shard)
-        limits = {
-            "episodes_per_task": (1, None),
-            "noise": (0, None),
-            "steps_after_success": (0, MAX_EPISODE_STEPS),
-            "max_attempts": (1, None),
-            "image_size": (16, None),
-            "seed": (0, None),
-            "num_workers": (1, None),
-        }
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            if value < low or (high is not None and value > high):
-                limit = f"at least {low}" if high is None else f"{low} to {high}"
-                raise ValueError(f"{name} is {value}; expected {limit}.")
 
     @property
     def output_root(self) -> Path:
@@ -108,14 +81,26 @@ class CollectConfig:
 
 
 def plan_shards(config: CollectConfig) -> list[Shard]:
-    """The shards of a collection in the order of the final dataset: by task, then by episode."""
+    """The shards of a collection in the order of the final dataset: by task, then by episode.
+
+    Raises:
+        ValueError: There is no such task, variation or camera, or two tasks would become one task of the dataset.
+    """
+    tasks, variations = resolve_tasks(config.tasks), parse_variations(config.variations)
+    check_variation_set(config.variation_set)
+    for description, (first_task, *others) in tasks_of_one_description(tasks).items():
+        kept = ",".join(task for task in tasks if task not in others)
+        raise ValueError(
+            f"{first_task} and {', '.join(others)} have one description, {description!r}, and would become one task of "
+            f"the dataset. Collect {', '.join(others)} into another dataset, and here --tasks={kept}."
+        )
     return [
         Shard(
             task=task,
             first=first,
             count=min(SHARD_EPISODES, config.episodes_per_task - first),
             variation_set=config.variation_set,
-            variations=parse_variations(config.variations),
+            variations=variations,
             noise=config.noise,
             steps_after_success=config.steps_after_success,
             max_attempts=config.max_attempts,
@@ -123,6 +108,6 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
             image_size=config.image_size,
             cameras=parse_cameras(config.camera_name),
         )
-        for task in resolve_tasks(config.tasks)
+        for task in tasks
         for first in range(0, config.episodes_per_task, SHARD_EPISODES)
     ]

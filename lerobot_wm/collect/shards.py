@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -139,23 +138,26 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in ("mujoco", "metaworld", "lerobot", "lerobot_policy_wm")}
 
 
-def write_shard(shard: Shard, folder: Path, on_episode: Callable[[], None]) -> None:
+def write_shard(shard: Shard, folder: Path) -> int:
     """Collect a shard into `folder / shard.name`; that folder appears only when it is complete.
 
     Args:
         shard: What to collect.
         folder: Folder of all shards.
-        on_episode: Called after each finished episode.
+
+    Returns:
+        The number of its episodes.
 
     Raises:
         RuntimeError: The expert failed an episode on every variation, `max_attempts` times each.
         ValueError: An observation, action or reward is not finite.
     """
     with appears_whole(folder / shard.name) as temporary:
-        _write_shard(shard, temporary, on_episode)
+        _write_shard(shard, temporary)
+    return shard.count
 
 
-def _write_shard(shard: Shard, root: Path, on_episode: Callable[[], None]) -> None:
+def _write_shard(shard: Shard, root: Path) -> None:
     start = time.monotonic()
     dataset = _create_dataset(root, shard)
     simulation = Simulation(shard.task, shard.variation_set)
@@ -172,7 +174,6 @@ def _write_shard(shard: Shard, root: Path, on_episode: Callable[[], None]) -> No
         for frame in frames:
             dataset.add_frame(frame)
         dataset.save_episode()
-        on_episode()
     dataset.finalize()
     for key in render_keys.values():
         Renderer.release(key)

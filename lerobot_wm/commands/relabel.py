@@ -4,7 +4,6 @@ Any policy type then learns from that reward, with both training commands.
 """
 
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +14,12 @@ import pyarrow.parquet as pq
 from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
 from lerobot.datasets.io_utils import write_stats, write_table_one_row_group_per_episode
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tqdm import tqdm
 
 from lerobot_wm.constants import REWARD
 from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.data.schema import RELABEL_RECORD
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.files import new_folder
+from lerobot_wm.files import copy_dataset, new_folder
 
 
 @dataclass
@@ -56,17 +54,14 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
         BlockingIOError: Another process is writing it.
         ValueError: The dataset has no `next.reward`, or no such column of its type and shape.
     """
-    if REWARD not in source.meta.features:
-        raise ValueError(
-            f"{source.repo_id} has no '{REWARD}' to replace: name the column when you train, with "
-            f"--policy.reward_key={reward}."
-        )
     kinds = {name: (feature["dtype"], *feature["shape"]) for name, feature in source.meta.features.items()}
-    if reward not in kinds or kinds[reward] != kinds[REWARD]:
-        alike = [name for name in kinds if name.startswith("next.") and kinds[name] == kinds[REWARD]]
+    expected = kinds.get(REWARD)
+    alike = [name for name, kind in kinds.items() if kind == expected]
+    if reward not in alike:
         raise ValueError(
             f"--reward={reward}: {source.repo_id} has no such column of the type and shape of its '{REWARD}', "
-            f"{kinds[REWARD]}. Columns of that type and shape: {', '.join(alike) or 'none'}."
+            f"{expected or 'which it lacks'}. Columns of that type and shape: {', '.join(alike) or 'none'}. A policy "
+            f"can also learn from a column under its own name: --policy.reward_key={reward}."
         )
     with new_folder(output_root) as temporary:
         _write(source, reward, temporary)
@@ -75,13 +70,7 @@ def relabel(source: LeRobotDataset, reward: str, output_repo_id: str, output_roo
 
 def _write(source: LeRobotDataset, reward: str, folder: Path) -> None:
     root = Path(source.root)
-    files = [
-        path for name in ("meta", "data", "videos") for path in (root / name).rglob("*") if path.is_file()
-    ]
-    for path in tqdm(files, desc="Copying", unit="file"):
-        copy = folder / path.relative_to(root)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(path, copy)
+    copy_dataset(root, folder)
     for file in (folder / "data").rglob("*.parquet"):
         table = pq.read_table(file)
         write_table_one_row_group_per_episode(_with_column(table, REWARD, table[reward]), file)

@@ -5,10 +5,11 @@ Both training commands take the copy.
 """
 
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import draccus
 import pyarrow as pa
@@ -17,10 +18,9 @@ from lerobot.datasets.io_utils import write_table_one_row_group_per_episode
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import EPISODES_DIR, INFO_PATH, STATS_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
-from tqdm import tqdm
 
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.files import new_folder
+from lerobot_wm.files import copy_dataset, new_folder
 
 
 @dataclass
@@ -70,25 +70,20 @@ def rename(
 
 
 def _write(root: Path, rename_map: Mapping[str, str], folder: Path) -> None:
-    files = [
-        path for name in ("meta", "data", "videos") for path in (root / name).rglob("*") if path.is_file()
-    ]
-    for path in tqdm(files, desc="Copying", unit="file"):
-        place = path.relative_to(root).as_posix()
-        copy = folder / _renamed(place, rename_map)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        if place in (INFO_PATH, STATS_PATH):
-            content = json.loads(path.read_text(encoding="utf-8"))
-            by_name = content["features"] if place == INFO_PATH else content
-            by_name = {_renamed(key, rename_map): value for key, value in by_name.items()}
-            content = {**content, "features": by_name} if place == INFO_PATH else by_name
-            copy.write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
-        elif place.startswith("data/") and path.suffix == ".parquet":
-            write_table_one_row_group_per_episode(_with_names(pq.read_table(path), rename_map), copy)
-        elif place.startswith(f"{EPISODES_DIR}/") and path.suffix == ".parquet":
-            pq.write_table(_with_names(pq.read_table(path), rename_map), copy)
-        else:
-            shutil.copy2(path, copy)
+    copy_dataset(root, folder, partial(_renamed, rename_map=rename_map))
+    info = json.loads((folder / INFO_PATH).read_text(encoding="utf-8"))
+    stats = json.loads((folder / STATS_PATH).read_text(encoding="utf-8"))
+    info["features"] = _with_new_keys(info["features"], rename_map)
+    for path, content in ((INFO_PATH, info), (STATS_PATH, _with_new_keys(stats, rename_map))):
+        (folder / path).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
+    for file in (folder / "data").rglob("*.parquet"):
+        write_table_one_row_group_per_episode(_with_names(pq.read_table(file), rename_map), file)
+    for file in (folder / EPISODES_DIR).rglob("*.parquet"):
+        pq.write_table(_with_names(pq.read_table(file), rename_map), file)
+
+
+def _with_new_keys(by_name: Mapping[str, Any], rename_map: Mapping[str, str]) -> dict[str, Any]:
+    return {rename_map.get(name, name): value for name, value in by_name.items()}
 
 
 def _renamed(name: str, rename_map: Mapping[str, str]) -> str:
@@ -105,8 +100,7 @@ def _with_names(table: pa.Table, rename_map: Mapping[str, str]) -> pa.Table:
     metadata.pop(b"pandas", None)  # it repeats the names of columns
     if b"huggingface" in metadata:  # the types with which `datasets` reads images and lists
         content = json.loads(metadata[b"huggingface"])
-        types = content["info"]["features"]
-        content["info"]["features"] = {_renamed(key, rename_map): kind for key, kind in types.items()}
+        content["info"]["features"] = _with_new_keys(content["info"]["features"], rename_map)
         metadata[b"huggingface"] = json.dumps(content).encode()
     names = [_renamed(name, rename_map) for name in table.column_names]
     return table.rename_columns(names).replace_schema_metadata(metadata)

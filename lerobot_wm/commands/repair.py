@@ -15,7 +15,7 @@ from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_wm.data.source import SourceConfig, dataset_folder, open_dataset
-from lerobot_wm.files import new_folder
+from lerobot_wm.files import copy_dataset, new_folder
 from lerobot_wm.system import quiet
 
 
@@ -43,7 +43,7 @@ def repair(repo_id: str, root: Path, output_root: Path) -> None:
         DatasetError: The copy would have other faults, such as missing files; nothing is written.
     """
     with new_folder(output_root) as copy, quiet():
-        shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".cache", "images"))
+        copy_dataset(root, copy)
         _convert(repo_id, copy)
         _number_frames(copy)
         open_dataset(repo_id, copy)

@@ -113,7 +113,7 @@ def encode_job(
 ) -> None:
     """Encode one job's part of a dataset into `<output_root>.parts`; `encode` makes a dataset of all parts.
 
-    Raises what `encode` does, and ValueError if there are more jobs than batches.
+    Raises what `encode` does.
     """
     _, latent_batches = _begin(policy, source, output_root, rename_map, sample_seed)
     batches = episode_batches(source)

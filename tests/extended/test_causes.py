@@ -19,13 +19,12 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 
 from lerobot_wm.cli import expand_home
 from lerobot_wm.collect.command import collect
-from lerobot_wm.collect.config import CollectConfig
+from lerobot_wm.collect.config import CollectConfig, plan_shards
 from lerobot_wm.commands.doctor import check_disk
 from lerobot_wm.data.cache import CACHE_VARIABLE, cache_root
 from lerobot_wm.data.check import DatasetError, read_file
 from lerobot_wm.data.source import open_dataset
 from lerobot_wm.encode.dataset import _remove_cameras_from_episodes
-from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.errors import disk_problem, exit_with_one_line
 from lerobot_wm.policies.common.tasks import only_episodes
 from lerobot_wm.system import name_user, opengl_fix
@@ -215,12 +214,13 @@ def test_two_datasets_of_one_name_do_not_share_a_cache(
 
 def test_two_tasks_of_one_description_are_not_collected_as_one() -> None:
     with pytest.raises(ValueError, match="push-back-v3") as error:
-        CollectConfig(repo_id="a/b", tasks="push-v3,reach-v3,push-back-v3")
+        plan_shards(CollectConfig(repo_id="a/b", tasks="push-v3,reach-v3,push-back-v3"))
     assert "--tasks=push-v3,reach-v3." in str(error.value)
     with pytest.raises(ValueError, match="push-back-v3") as error:
-        CollectConfig(repo_id="a/b", tasks="mt50")
+        plan_shards(CollectConfig(repo_id="a/b", tasks="mt50"))
     kept = str(error.value).partition("--tasks=")[2].rstrip(".")
-    assert len(resolve_tasks(CollectConfig(repo_id="a/b", tasks=kept).tasks)) == 49
+    shards = plan_shards(CollectConfig(repo_id="a/b", tasks=kept))
+    assert len({shard.task for shard in shards}) == 49
 
 
 def test_a_policy_knows_the_tasks_that_it_was_trained_on(recorded: LeRobotDataset) -> None:

@@ -70,7 +70,7 @@ def test_seed_decides_the_weights(
 def test_a_checkpoint_is_never_overwritten(
     untrained_path: Path, demos_root: Path, lerobot_wm_command: Callable[..., None]
 ) -> None:
-    with pytest.raises(FileExistsError, match="another --output_dir"):
+    with pytest.raises(FileExistsError, match="pretrained_model"):
         lerobot_wm_command(
             "init --policy.type=wm_rssm",
             DATASET_FLAGS.format(root=demos_root),

@@ -110,18 +110,8 @@ def test_a_part_that_was_not_copied_whole_is_refused(gathered: Path) -> None:
 @pytest.mark.parametrize("shard", ["1", "a/b", "0/4", "5/4", "1/0", "-1/4"])
 def test_shard_that_is_none(shard: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=f"shard is '{shard}'"):
-        job(tmp_path, shard=shard)
-
-
-def test_the_command_says_what_is_wrong(tmp_path: Path, lerobot_wm_command: Callable[..., None]) -> None:
-    with pytest.raises(SystemExit, match=r"lerobot-wm collect: .*shard is '3/2'"):
-        lerobot_wm_command(f"collect --repo_id=test/demos --root={tmp_path}/dataset --shard=3/2")
-
-
-def test_more_jobs_than_shards(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"1/3.* 2 parts"):
-        collect(job(tmp_path / "dataset", shard="1/3"))
-    assert not list(tmp_path.iterdir())
+        collect(job(tmp_path / "dataset", shard=shard))
+    assert not any(tmp_path.iterdir())
 
 
 def test_shares_are_disjoint_and_even() -> None:

@@ -114,23 +114,6 @@ def test_without_the_flag_nothing_is_logged(tracked_run: Path, tmp_path: Path) -
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("mode", "found"), [("online", "API key"), ("ofline", "'ofline'")])
-def test_an_error_of_wandb_says_how_to_fix_it(
-    mode: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # As on a machine where nobody has logged in.
-    monkeypatch.delenv("WANDB_API_KEY", raising=False)
-    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
-    monkeypatch.setenv("WANDB_CONFIG_DIR", str(tmp_path))
-    monkeypatch.setenv("WANDB_ERROR_REPORTING", "false")
-    cfg = WandBConfig(enable=True, mode=mode)
-    with (
-        pytest.raises(RuntimeError, match=rf"(?s){found}.*--wandb\.mode=offline"),
-        wandb_run(cfg, None, tmp_path),
-    ):
-        pass
-
-
 def test_the_run_is_that_of_the_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each revision of a checkpoint on the Hub was trained in a run of its own."""
     repository = tmp_path / "hub" / "models--user--wm"

@@ -47,7 +47,7 @@ def test_collection(tmp_path: Path) -> None:
         shard = Shard("reach-v3", 0, 2, REPORTED_VARIATION_SET, (0, 1), 0.3, 2, 1, seed, 32, ("corner2",))
         draw(drawn)
         with quiet():
-            write_shard(shard, tmp_path / str(drawn), on_episode=lambda: None)
+            write_shard(shard, tmp_path / str(drawn))
         shards.append(files(tmp_path / str(drawn) / shard.name))
     once, again, other = shards
     assert once == again

@@ -58,7 +58,7 @@ def test_data_is_refused_when_it_is_collected(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(
         ValueError, match=r"reach-v3, episode 7, variation 0, frame \d+: next.dense_reward is not finite"
     ):
-        write_shard(shard, tmp_path, on_episode=lambda: None)
+        write_shard(shard, tmp_path)
     assert not (tmp_path / shard.name).exists()
 
 

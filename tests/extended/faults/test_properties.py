@@ -72,8 +72,6 @@ def test_gathering_is_indexing(data: st.DataObject, rows: int, length: int) -> N
 @settings(max_examples=200, **SETTINGS)
 @given(n_parts=st.integers(1, 60), count=st.integers(1, 60))
 def test_shares_are_everything_once_and_even(n_parts: int, count: int) -> None:
-    if count > n_parts:
-        return
     shares = [Job(index, count).select(range(n_parts)) for index in range(1, count + 1)]
     assert sorted(part for share in shares for part in share) == list(range(n_parts))
     assert max(map(len, shares)) - min(map(len, shares)) <= 1

@@ -61,10 +61,14 @@ def odd_repositories(hub: Hub) -> None:
         # The token does not do.
         (f"{ENCODE}user/wm", "wrong-token", "Invalid credentials"),
         (f"{ENCODE}user/secret", "", "or it is private"),
-        (f"{TRAIN} --dataset.repo_id=user/demos --policy.repo_id=user/x", "", "there is no token"),
+        (
+            f"{TRAIN} --dataset.repo_id=user/demos --policy.repo_id=user/x",
+            "",
+            "asks for a token and there is none",
+        ),
         ("collect --repo_id=else/x --root={folder}/x --push_to_hub=true", "write-user", "belongs to else"),
         (f"{ENCODE}user/wm --push_to_hub=true", "read-user", "is read-only"),
-        ("publish --policy.path={folder} --repo_id=user/x", "", "pushing to user/x needs a token"),
+        ("publish --policy.path={folder} --repo_id=user/x", "", "asks for a token and there is none"),
         # What is there would be lost.
         (
             f"{GO_ON} --dataset.repo_id=user/demos",

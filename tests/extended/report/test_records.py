@@ -39,7 +39,7 @@ def test_one_arm_under_two_presets_is_refused(make_records: Callable, tmp_path: 
     assert len(read_records([path])) == 100, "arms may differ in their presets"
     path.write_text("".join(map(record_line, records + other_seed)))
     with pytest.raises(
-        ValueError, match=r"records\.jsonl:51: .*'wm_bc'.*'paper'.*'test'.*records\.jsonl:1\b"
+        ValueError, match=r"records\.jsonl:51: preset .*'wm_bc'.*'paper'.*'test'.*records\.jsonl:1\b"
     ):
         read_records([path])
 
@@ -51,7 +51,7 @@ def test_positions_of_different_sets_are_refused(make_records: Callable, tmp_pat
     path.write_text("".join(map(record_line, make_records("wm_bc", {"reach-v3": (1, 1)}) + elsewhere)))
     with pytest.raises(
         ValueError,
-        match=r"records\.jsonl:51: variation 0 of reach-v3 .*seen False.* True .*:1\. .*--env\.variation_set",
+        match=r"records\.jsonl:51: seen .*'reach-v3', 0.* False.* True .*:1\. .*--env\.variation_set",
     ):
         read_records([path])
 
@@ -60,13 +60,9 @@ def test_lines_that_are_not_records_are_named(records_file: Path) -> None:
     good = records_file.read_text().splitlines()[0]
     without_steps = json.loads(good)
     del without_steps["steps"]
-    for bad, message in (
-        (good[:30], "is not JSON"),
-        (json.dumps(without_steps), "expected the keys"),
-        ("[]", "list"),
-    ):
+    for bad in (good[:30], json.dumps(without_steps), "[]"):
         records_file.write_text(f"{good}\n{bad}\n")
-        with pytest.raises(ValueError, match=rf"records\.jsonl:2 .*{message}"):
+        with pytest.raises(ValueError, match=r"records\.jsonl:2 .*'steps'"):
             read_records([records_file])
 
 
@@ -86,6 +82,6 @@ def test_sets_without_seen_variations_are_not_mixed(make_records: Callable, tmp_
     path.write_text("".join(map(record_line, unseen + arms[43] + arms[44])))
     with pytest.raises(
         ValueError,
-        match=r"records\.jsonl:101: variation 0 of reach-v3 .*variation_set 44.* 43 .*:51\.",
+        match=r"records\.jsonl:101: variation_set .*'reach-v3', 0.* 44.* 43 .*:51\.",
     ):
         read_records([path])
