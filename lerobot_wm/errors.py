@@ -2,7 +2,6 @@
 
 import errno
 import os
-import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,13 +11,10 @@ from traceback import clear_frames, walk_tb
 import httpx
 from huggingface_hub import constants, whoami
 from huggingface_hub.errors import (
-    EntryNotFoundError,
     HfHubHTTPError,
     HFValidationError,
     LocalTokenNotFoundError,
     OfflineModeIsEnabled,
-    RepositoryNotFoundError,
-    RevisionNotFoundError,
 )
 
 INTERRUPTED = 130  # exit code after Ctrl-C: 128 plus the signal's number
@@ -68,7 +64,7 @@ def exit_with_one_line(command: str) -> Iterator[None]:
         print(f"\n{command}: interrupted; {hint}.", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     except Exception as error:
-        line = _one_line_for(error)
+        line = line_for(error)
         if line is None:
             raise
         _close_progress_bars(error)
@@ -80,24 +76,6 @@ def _close_progress_bars(error: BaseException | None) -> None:
     while error is not None:
         clear_frames(error.__traceback__)
         error = error.__context__
-
-
-@contextmanager
-def errors_as_lines() -> Iterator[None]:
-    """In a worker process: turn errors that deserve one line into a `WorkerError` with that line.
-
-    A traceback does not reach the parent process, which could not tell where the error was raised.
-
-    Raises:
-        WorkerError: Instead of such an error; others pass.
-    """
-    try:
-        yield
-    except Exception as error:
-        line = _one_line_for(error)
-        if line is None:
-            raise
-        raise WorkerError(line) from error
 
 
 def disk_problem(error: BaseException) -> str | None:
@@ -138,7 +116,8 @@ def cache_folders() -> dict[str, Path]:
     return {variable: Path(folder).expanduser() for variable, folder in places.items()}
 
 
-def _one_line_for(error: Exception) -> str | None:
+def line_for(error: Exception) -> str | None:
+    """The one line that tells the user what to do; None for an error that keeps its traceback."""
     # In a chain of errors the first about the Hub says most: those before wrap it, those after are httpx's.
     for cause in _causes(error):
         if (refusal := _hub_problem(cause)) is not None:
@@ -217,7 +196,9 @@ def _hub_problem(error: BaseException) -> str | None:
         case HFValidationError():
             return f"neither a folder on this machine nor a repository name, user/name. {one_line(error)}"
         case HfHubHTTPError():
-            return _hub_answer(error)
+            # Its message has the address, and for the most part what to check.
+            refused = error.response.status_code in (401, 403)
+            return f"{one_line(error)} For a private repository, {LOGIN}." if refused else one_line(error)
         case httpx.TransportError():
             return _connection_problem(error)
     return None
@@ -238,39 +219,3 @@ def _connection_problem(error: httpx.TransportError) -> str:
         f"{found}while writing to {request.url.path}: an unfinished push changes nothing on the Hub. Run the command "
         "again; files that arrived are not sent twice."
     )
-
-
-def _hub_answer(error: HfHubHTTPError) -> str:
-    url, status = error.response.url, error.response.status_code
-    kind, repo_id, revision = _repository_in(url.path)
-    match error:
-        case RevisionNotFoundError():
-            prefix = "datasets/" if kind == "dataset" else ""
-            page = f"{url.scheme}://{url.netloc.decode()}/{prefix}{repo_id}/commits/main"
-            return (
-                f"{kind} {repo_id} has no revision {revision!r}; expected one of its branches, tags or commits, "
-                f"see {page}."
-            )
-        case EntryNotFoundError():
-            return f"{kind} {repo_id} has no such file ({url}): check the name, and whether its upload has finished."
-        case RepositoryNotFoundError():
-            return (
-                f"there is no {kind} {repo_id} on the Hub, or it is private and this token cannot read it ({status}): "
-                f"check the name; for a private repository, {LOGIN}."
-            )
-    answer = one_line(error.server_message or error)
-    if status in (401, 403):
-        return f"the Hub refuses ({status}, {answer}): {LOGIN}, with a token that may use {url.path}."
-    return f"the Hub answered {status} for {url}: {answer}"
-
-
-def _repository_in(path: str) -> tuple[str, str, str | None]:
-    """Kind of repository, its name and the revision in a path of the Hub."""
-    match = re.match(
-        r"/(?:api/)?(?P<kind>datasets/|models/)?(?P<repo_id>[^/]+/[^/]+)(?:/[a-z-]+/(?P<revision>[^/]+))?",
-        path,
-    )
-    if match is None:
-        return "repository", path, None
-    kind = "dataset" if match["kind"] == "datasets/" else "model"
-    return kind, match["repo_id"], match["revision"]

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot_wm.errors import errors_as_lines
+from lerobot_wm.errors import WorkerError, line_for
 
 
 def map_in_workers[Item, Result](
@@ -36,37 +36,41 @@ def map_in_workers[Item, Result](
     Raises:
         WorkerError: An error of a worker that is one line; others are raised as they are.
     """
-    with (
-        ProcessPoolExecutor(
-            num_workers, multiprocessing.get_context("spawn"), _start_worker, (start, start_args)
-        ) as pool,
-        workers_interrupted(),
-    ):
-        with delay_interrupts():
-            results = pool.map(partial(_call, function), items)
-        yield from results
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(num_workers, context, _start_worker, (start, start_args)) as pool:
+        try:
+            with delay_interrupts():
+                results = pool.map(partial(_call, function), items)
+            yield from results
+        except (KeyboardInterrupt, GeneratorExit):
+            # Instead of waiting for their work.
+            for worker in multiprocessing.active_children():
+                worker.terminate()
+            raise
 
 
 def _start_worker(start: Callable[..., None], start_args: tuple[object, ...]) -> None:
-    end_with_parent()
+    # Otherwise a worker would outlive a killed parent, and keep writing into the output.
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     start(*start_args)
 
 
-def _call[Item, Result](function: Callable[[Item], Result], item: Item) -> Result:
-    with errors_as_lines():
-        return function(item)
-
-
-def end_with_parent() -> None:
-    """End this worker when its parent process ends; otherwise it would keep writing into the output."""
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-
-
-def _exit_with_parent() -> None:
+def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+def _call[Item, Result](function: Callable[[Item], Result], item: Item) -> Result:
+    try:
+        return function(item)
+    except Exception as error:
+        # A traceback does not reach the parent process, which could not tell where the error was raised.
+        line = line_for(error)
+        if line is None:
+            raise
+        raise WorkerError(line) from error
 
 
 @contextmanager
@@ -104,17 +108,6 @@ def delay_interrupts() -> Iterator[None]:
             yield
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def workers_interrupted() -> Iterator[None]:
-    """On Ctrl-C, or when a generator is closed, end this process's workers instead of waiting for their work."""
-    try:
-        yield
-    except (KeyboardInterrupt, GeneratorExit):
-        for worker in multiprocessing.active_children():
-            worker.terminate()
-        raise
 
 
 @dataclass(frozen=True)

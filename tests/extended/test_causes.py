@@ -18,8 +18,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_policy_config
 
 from lerobot_wm.cli import expand_home
-from lerobot_wm.collect.command import collect
-from lerobot_wm.collect.config import CollectConfig, plan_shards
+from lerobot_wm.collect.command import CollectConfig, collect, plan_shards
 from lerobot_wm.commands.doctor import check_disk
 from lerobot_wm.data.cache import CACHE_VARIABLE, cache_root
 from lerobot_wm.data.check import DatasetError, read_file

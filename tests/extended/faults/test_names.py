@@ -12,7 +12,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import save_file
 
-from lerobot_wm.collect.config import CollectConfig
+from lerobot_wm.collect.command import CollectConfig
 from lerobot_wm.commands.relabel import relabel
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.loader import RamDataset

@@ -33,17 +33,17 @@ def odd_repositories(hub: Hub) -> None:
         (
             f"{TRAIN} --policy.push_to_hub=false --dataset.repo_id=user/nothing",
             "",
-            "no dataset user/nothing on the Hub",
+            "/api/datasets/user/nothing",
         ),
         (f"{ENCODE}user/wm --dataset.revision=v9", "write-user", "it has the versions v3.0"),
-        (f"{ENCODE}user/wm --dataset.revision=nope", "write-user", "user/demos has no revision 'nope'"),
+        (f"{ENCODE}user/wm --dataset.revision=nope", "write-user", "Revision Not Found"),
         (f"{ENCODE}user/wm --dataset.repo_id=user/half", "write-user", "its upload did not finish"),
         (
             f"{ENCODE}user/wm --dataset.repo_id=user/old",
             "write-user",
             "lerobot-wm repair --dataset.repo_id=user/old",
         ),
-        (f"{ENCODE}user/wm@v9", "write-user", "model user/wm has no revision 'v9'"),
+        (f"{ENCODE}user/wm@v9", "write-user", "Revision Not Found"),
         (f"{ENCODE}outputs/no/such/folder", "write-user", "neither a folder on this machine nor"),
         (
             "report --records={folder}/records.jsonl --dataset.repo_id=user/demos --dataset.revision=v9",
@@ -56,11 +56,11 @@ def odd_repositories(hub: Hub) -> None:
             "write-user",
             "it has the versions v3.0",
         ),
-        (f"{EVAL}user/nothing", "", "no model user/nothing on the Hub"),
+        (f"{EVAL}user/nothing", "", "user/nothing"),
         ("publish --policy.path={folder} --repo_id=user/x", "write-user", "holds no train_config.json"),
         # The token does not do.
         (f"{ENCODE}user/wm", "wrong-token", "Invalid credentials"),
-        (f"{ENCODE}user/secret", "", "or it is private"),
+        (f"{ENCODE}user/secret", "", "private or gated"),
         (
             f"{TRAIN} --dataset.repo_id=user/demos --policy.repo_id=user/x",
             "",
