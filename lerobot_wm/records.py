@@ -67,8 +67,7 @@ def new_records(path: Path) -> Iterator[None]:
     with sole_writer(path):
         if path.exists():
             raise FileExistsError(
-                f"{path} holds the records of an earlier evaluation. Remove it, or choose another --output_dir (or "
-                "--records for lerobot-wm eval)."
+                f"{path} holds the records of an earlier evaluation. Remove it, or choose another --output_dir."
             )
         yield
 

@@ -6,7 +6,7 @@ import os
 import re
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from lerobot_wm.errors import WorkerError, line_for
 
 def map_in_workers[Item, Result](
     function: Callable[[Item], Result],
-    items: Iterable[Item],
+    items: Sequence[Item],
     num_workers: int,
     start: Callable[..., None],
     *start_args: object,
@@ -29,13 +29,17 @@ def map_in_workers[Item, Result](
     Args:
         function: A module-level function, because worker processes find it by its name.
         items: Its arguments.
-        num_workers: Number of processes.
+        num_workers: Number of processes, at most one for each item; up to one, this process does the work.
         start: Called first in each process.
         *start_args: Arguments of `start`.
 
     Raises:
         WorkerError: An error of a worker that is one line; others are raised as they are.
     """
+    num_workers = min(num_workers, len(items))
+    if num_workers <= 1:
+        yield from map(function, items)
+        return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(num_workers, context, _start_worker, (start, start_args)) as pool:
         try:

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.sides.agent_settings import OBSERVATION_DIM
+from benchmarks.sides.shared import OBSERVATION_DIM
 from benchmarks.timing import Prepared, timed_updates
 from lerobot_wm.constants import ACTION_DIM
 from lerobot_wm.nn.mlp import MLP

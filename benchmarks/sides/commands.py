@@ -8,8 +8,7 @@ from pathlib import Path
 
 from lerobot.policies import make_pre_post_processors
 
-from benchmarks.data import REPO_ID, TASKS
-from benchmarks.policies import wm_bc
+from benchmarks.data import REPO_ID, TASKS, wm_bc
 from benchmarks.timing import Prepared
 from lerobot_wm.constants import IMAGE_SIZE, MT6
 

@@ -9,7 +9,7 @@ from d3rlpy.algos.qlearning.base import QLearningAlgoBase
 from d3rlpy.dataset import TransitionMiniBatch
 from d3rlpy.models.encoders import VectorEncoderFactory
 
-from benchmarks.sides.agent_settings import (
+from benchmarks.sides.shared import (
     ACTION_DIM,
     BETA,
     DISCOUNT,

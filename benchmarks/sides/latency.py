@@ -7,7 +7,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.pretrained import PreTrainedPolicy
 
-from benchmarks.policies import input_features, output_features, wm_bc
+from benchmarks.data import input_features, output_features, wm_bc
 from benchmarks.timing import Prepared, rate
 from lerobot_wm.constants import IMAGE_SIZE, MT6, OBS_IMAGE, OBS_STATE, STATE_DIM, TASK
 from lerobot_wm.envs.tasks import task_description

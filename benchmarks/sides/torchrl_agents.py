@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import BCLoss, IQLLoss, SoftUpdate
 
-from benchmarks.sides.agent_settings import (
+from benchmarks.sides.shared import (
     ACTION_DIM,
     BETA,
     DISCOUNT,

@@ -17,7 +17,7 @@ from torchrl.modules import MLP, ObsDecoder, ObsEncoder, RSSMPosterior, RSSMPrio
 from torchrl.modules.tensordict_module.world_models import WorldModelWrapper
 from torchrl.objectives import DreamerModelLoss
 
-from benchmarks.sides.dreamer_check import batch_file, half_noise
+from benchmarks.sides.shared import batch_file, half_noise
 from benchmarks.timing import Prepared, timed_updates
 
 STATE, HIDDEN, EMBED, ACTION = 256, 256, 1024, 4

@@ -6,7 +6,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from benchmarks.sides.dreamer_check import batch_file, half_noise
+from benchmarks.sides.shared import batch_file, half_noise
 from benchmarks.timing import Prepared, timed_updates
 from lerobot_wm.constants import ACTION_DIM, IMAGE_SIZE
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig

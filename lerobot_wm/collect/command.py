@@ -219,13 +219,10 @@ def _count_finished(shards: list[Shard], folder: Path) -> int:
 def write_missing_shards(shards: list[Shard], folder: Path, num_workers: int) -> None:
     """Write the shards that are not in `folder` yet, with a progress bar over all episodes."""
     missing = [shard for shard in shards if not (folder / shard.name).exists()]
-    write = partial(write_shard, folder=folder)
-    workers = min(num_workers, len(missing))
-    written = map(write, missing) if workers <= 1 else map_in_workers(write, missing, workers, silence)
     total = sum(shard.count for shard in shards)
     done = total - sum(shard.count for shard in missing)
     with tqdm(total=total, initial=done, unit="episode", desc="collecting") as bar:
-        for count in written:
+        for count in map_in_workers(partial(write_shard, folder=folder), missing, num_workers, silence):
             bar.update(count)
 
 

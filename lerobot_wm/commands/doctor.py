@@ -3,6 +3,7 @@
 import argparse
 import importlib.metadata
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -68,19 +69,6 @@ class Check:
         return self.needed and bool(self.fix)
 
 
-def check_python() -> Check:
-    """Check the interpreter's version, which pyproject.toml requires too."""
-    found = ".".join(map(str, sys.version_info[:3]))
-    fix = "" if sys.version_info >= (3, 12) else "create the environment with Python 3.12 or newer"
-    return Check("Python", f"{found} ({sys.executable})", fix)
-
-
-def requirements() -> list[Requirement]:
-    """The dependencies of our distribution, without its extras."""
-    declared = [Requirement(line) for line in importlib.metadata.requires(DISTRIBUTION) or []]
-    return [r for r in declared if r.marker is None or r.marker.evaluate({"extra": ""})]
-
-
 def check_requirement(requirement: Requirement, installed: dict[str, str]) -> Check:
     """Check the installed version of a dependency.
 
@@ -104,7 +92,10 @@ def check_packages(installed: dict[str, str]) -> list[Check]:
     Args:
         installed: Version by distribution name (lower case, dashes).
     """
-    checks = [check_requirement(r, installed) for r in requirements()]
+    declared = [Requirement(line) for line in importlib.metadata.requires(DISTRIBUTION) or []]
+    # Those of extras have a marker that holds only for the extra.
+    needed = [r for r in declared if r.marker is None or r.marker.evaluate({"extra": ""})]
+    checks = [check_requirement(r, installed) for r in needed]
     main = [c for c in checks if c.name in MAIN_PACKAGES]
     others = [c for c in checks if c.name not in MAIN_PACKAGES]
     broken = [c for c in others if c.is_broken]
@@ -155,22 +146,13 @@ def check_discovery() -> Check:
     """Check that LeRobot's own commands find our policy types and environment type."""
     run = subprocess.run([sys.executable, "-P", "-c", DISCOVERY], capture_output=True, text=True)
     if run.returncode != 0:
-        return Check(
-            "LeRobot plug-in",
-            last_words(run),
-            "reinstall: pip install -e . (or the wheel)",
-        )
+        return Check("LeRobot plug-in", last_words(run), "reinstall: pip install -e . (or the wheel)")
     expected = (*POLICY_TYPES, ENV_TYPE)
     missing = [name for name in expected if name not in run.stdout.split()]
     if missing:
         how = f"install the distribution {DISTRIBUTION} into this environment: pip install -e ."
         return Check("LeRobot plug-in", f"LeRobot does not find {', '.join(missing)}", how)
     return Check("LeRobot plug-in", f"LeRobot finds {', '.join(expected)}")
-
-
-def check_cpu() -> Check:
-    """Report cores, PyTorch's threads and whether the CPU computes bfloat16 natively."""
-    return Check("CPU", f"{usable_cores()} cores, {torch.get_num_threads()} PyTorch threads, {cpu_kind()}")
 
 
 def check_gpu() -> Check:
@@ -188,40 +170,23 @@ def check_gpu() -> Check:
     return Check("GPU", "none: everything runs on the CPU", needed=False)
 
 
-def check_disk(name: str, folder: Path) -> Check:
-    """Check that outputs can be written, and that there is room for them.
-
-    Args:
-        name: Name of the check.
-        folder: A folder, which need not exist yet.
-    """
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    if (unwritable := check_cache(name, folder)).is_broken:
-        return unwritable
-    free = shutil.disk_usage(existing).free / 1e9
-    fix = "" if free >= MIN_FREE_GB else f"free {MIN_FREE_GB:.0f} GB there, or work on another disk"
-    return Check(name, f"{free:.1f} GB free at {folder}", fix)
-
-
-def check_cache(name: str, folder: Path) -> Check:
-    """Check that files can be written into a folder.
+def check_folder(name: str, folder: Path, free_gb: float = MIN_FREE_GB) -> Check:
+    """Check that files can be written into a folder, and that there is room for them.
 
     Args:
         name: Name of the check, and the variable that chooses another folder where there is one.
         folder: A folder, which need not exist yet.
+        free_gb: Room that is needed there.
     """
     try:
         check_writable(folder)
     except OSError as error:
         fix = f"make {error.filename} writable, or choose another folder"
         return Check(name, f"{folder}: {error.strerror}", fix)
-    return Check(name, f"{folder} can be written")
-
-
-def check_hub() -> Check:
-    """Look for a token of the Hugging Face Hub, which only pushing needs, without using the network."""
-    login = "token found (test it with: hf auth whoami)" if get_token() else "none; to push: hf auth login"
-    return Check("Hub login", login, needed=False)
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    free = shutil.disk_usage(existing).free / 1e9
+    fix = "" if free >= free_gb else f"free {free_gb:.0f} GB there, or work on another disk"
+    return Check(name, f"{free:.1f} GB free at {folder}", fix)
 
 
 def diagnose() -> list[Check]:
@@ -229,14 +194,18 @@ def diagnose() -> list[Check]:
     folders = cache_folders()
     if place := os.environ.get("LEROBOT_WM_CACHE"):
         folders["LEROBOT_WM_CACHE"] = Path(place)
-    single: list[Callable[[], Check]] = [check_rendering, check_discovery, check_cpu, check_gpu, check_hub]
+    slow: list[Callable[[], Check]] = [check_rendering, check_discovery, check_gpu]
+    threads = f"{usable_cores()} cores, {torch.get_num_threads()} PyTorch threads, {cpu_kind()}"
+    login = "token found (test it with: hf auth whoami)" if get_token() else "none; to push: hf auth login"
     return [
-        check_python(),
+        Check("Python", f"{platform.python_version()} ({sys.executable})"),
         *check_packages(installed_versions()),
-        *[check() for check in tqdm(single, desc="Checking", unit="check", leave=False)],
-        check_disk("disk, this folder", Path.cwd()),
-        *[check_disk(f"disk, {variable}", folder) for variable, folder in folders.items()],
-        check_cache("home folder", Path.home()),
+        *[check() for check in tqdm(slow, desc="Checking", unit="check", leave=False)],
+        Check("CPU", threads),
+        Check("Hub login", login, needed=False),
+        check_folder("disk, this folder", Path.cwd()),
+        *[check_folder(f"disk, {variable}", folder) for variable, folder in folders.items()],
+        check_folder("home folder", Path.home(), free_gb=0),
     ]
 
 

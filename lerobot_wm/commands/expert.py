@@ -1,6 +1,5 @@
 """`lerobot-wm expert`: roll out the scripted expert without noise, once on each variation, as a reference."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -43,39 +42,6 @@ class ExpertConfig:
     # Processes; each takes whole tasks.
     num_workers: int = 2
 
-    @property
-    def records_file(self) -> Path:
-        """The records file to write."""
-        return self.output_dir / RECORDS_NAME
-
-
-def roll_out_expert(cfg: ExpertConfig) -> list[Record]:
-    """Roll out the experts and write their records, as `lerobot-wm eval` does for a policy.
-
-    Raises:
-        ValueError: There is no such task, variation or set of variations.
-        FileExistsError, BlockingIOError: See `new_records`.
-    """
-    tasks, variations = resolve_tasks(cfg.tasks), parse_variations(cfg.variations)
-    check_variation_set(cfg.variation_set)
-    with new_records(cfg.records_file):
-        progress = tqdm(_rollouts(cfg, tasks, variations), total=len(tasks), desc="Rolling out", unit="task")
-        records = [record for task_records in progress for record in task_records]
-        write_whole(cfg.records_file, "".join(map(record_line, records)))
-    return records
-
-
-def _rollouts(
-    cfg: ExpertConfig, tasks: tuple[str, ...], variations: tuple[int, ...]
-) -> Iterator[list[Record]]:
-    """Records task by task, in the order of `tasks`."""
-    roll_out = partial(_roll_out, cfg, variations)
-    if cfg.num_workers <= 1:
-        with quiet():
-            yield from map(roll_out, tasks)
-        return
-    yield from map_in_workers(roll_out, tasks, min(cfg.num_workers, len(tasks)), silence)
-
 
 def _roll_out(cfg: ExpertConfig, variations: tuple[int, ...], task: str) -> list[Record]:
     simulation = Simulation(task, cfg.variation_set)
@@ -108,6 +74,13 @@ def _record(cfg: ExpertConfig, simulation: Simulation, variation: int) -> Record
 def main() -> None:
     """Entry point of `lerobot-wm expert`."""
     cfg = draccus.parse(ExpertConfig)
-    records = roll_out_expert(cfg)
+    tasks, variations = resolve_tasks(cfg.tasks), parse_variations(cfg.variations)
+    check_variation_set(cfg.variation_set)
+    file = cfg.output_dir / RECORDS_NAME
+    with new_records(file), quiet():
+        rollouts = map_in_workers(partial(_roll_out, cfg, variations), tasks, cfg.num_workers, silence)
+        progress = tqdm(rollouts, total=len(tasks), desc="Rolling out", unit="task")
+        records = [record for task_records in progress for record in task_records]
+        write_whole(file, "".join(map(record_line, records)))
     Console(width=100).print(*terminal_tables(table_by_split("Success of the scripted expert", records)))
-    print(f"Records: {cfg.records_file}")
+    print(f"Records: {file}")

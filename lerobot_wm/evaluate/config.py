@@ -31,8 +31,6 @@ class EvaluateConfig(EvalPipelineConfig):
     """LeRobot's evaluation flags, and those of the records."""
 
     eval: BatchedEvalConfig = field(default_factory=BatchedEvalConfig)
-    # Records file to write; <output_dir>/records.jsonl when not given.
-    records: Path | None = None
     # Name of the method in tables; the policy type when not given.
     arm: str | None = None
     # Name of the settings the policy was trained with.
@@ -69,7 +67,7 @@ class EvaluateConfig(EvalPipelineConfig):
     @property
     def records_file(self) -> Path:
         """The records file to write."""
-        return self.records or Path(self.output_dir) / RECORDS_NAME
+        return Path(self.output_dir) / RECORDS_NAME
 
     @property
     def arm_name(self) -> str:

@@ -90,7 +90,7 @@ def report_command(plan: Plan, runs: list[tuple[Arm, int]], records: Path, folde
     evaluations = [stage for run in trained for stage in plan.evaluations(*run)]
     trainings = [stage for arm, seed in trained if not arm.individual for stage in plan.policies(arm, seed)]
     seed = runs[0][1]
-    world_model, quality, dataset = plan.world_model(seed), plan.quality(seed), plan.demonstrations.sparse()
+    world_model, quality, dataset = plan.world_model(seed), plan.quality(seed), plan.demonstrations()
     flags: dict[str, object] = {
         "records": records,
         "output_dir": folder,

@@ -33,20 +33,27 @@ from lerobot_wm.workers import parts_folder, shards_folder
 
 
 @dataclass(frozen=True)
-class Demonstrations:
-    """Scripted demonstrations of the preset's tasks, in folders of `output_dir`."""
+class Plan:
+    """Builds the stages of an experiment.
+
+    Args:
+        preset: Its sizes.
+        output_dir: Where everything is written.
+        variation_set: The fixed variations that policies are rolled out on.
+    """
 
     preset: Preset
     output_dir: Path
+    variation_set: int = REPORTED_VARIATION_SET
 
-    def sparse(self) -> Dataset:
-        """Those of the seen variations, with the 0/1 reward."""
+    def demonstrations(self) -> Dataset:
+        """Scripted demonstrations of the seen variations, with the 0/1 reward."""
         count = self.preset.episodes_per_task
         return self._collect("dataset", count, NUM_SEEN_VARIATIONS, REPORTED_VARIATION_SET)
 
-    def dense(self) -> Dataset:
+    def dense_demonstrations(self) -> Dataset:
         """The same ones with Meta-World's shaped reward."""
-        source, folder = self.sparse(), self.output_dir / "dataset_dense"
+        source, folder = self.demonstrations(), self.output_dir / "dataset_dense"
         repo_id = f"local/{self.preset.name}_{folder.name}"
         flags = {
             **source.flags(),
@@ -64,8 +71,8 @@ class Demonstrations:
         )
         return Dataset(stage, repo_id)
 
-    def held_out(self) -> Dataset:
-        """Those of variations that nothing is trained on, at most one episode each."""
+    def held_out_demonstrations(self) -> Dataset:
+        """Demonstrations of variations that nothing is trained on, at most one episode each."""
         count = min(NUM_VARIATIONS, self.preset.episodes_per_task)
         return self._collect("held_out", count, NUM_VARIATIONS, SELECTION_VARIATION_SET)
 
@@ -93,26 +100,6 @@ class Demonstrations:
         )
         return Dataset(stage, repo_id)
 
-
-@dataclass(frozen=True)
-class Plan:
-    """Builds the stages of an experiment.
-
-    Args:
-        preset: Its sizes.
-        output_dir: Where everything is written.
-        variation_set: The fixed variations that policies are rolled out on.
-    """
-
-    preset: Preset
-    output_dir: Path
-    variation_set: int = REPORTED_VARIATION_SET
-
-    @property
-    def demonstrations(self) -> Demonstrations:
-        """Its datasets."""
-        return Demonstrations(self.preset, self.output_dir)
-
     def evaluations(self, arm: Arm, seed: int) -> list[Stage]:
         """The last stages of an arm and seed. Each writes a records.jsonl into its folder."""
         if arm.training is None:
@@ -134,7 +121,7 @@ class Plan:
     def quality(self, seed: int) -> Stage:
         """The quality of this seed's world model on variations that it was not trained on."""
         world_model = self.world_model(seed)
-        training, held_out = self.demonstrations.sparse(), self.demonstrations.held_out()
+        training, held_out = self.demonstrations(), self.held_out_demonstrations()
         name = f"seed_{seed}/quality"
         folder = self.output_dir / name
         flags = {"world_model_path": world_model.path, **held_out.flags(), **training.flags("train_dataset")}
@@ -148,7 +135,7 @@ class Plan:
         )
 
     def _encoder(self, encoder: Encoder, seed: int) -> Checkpoint:
-        source = self.demonstrations.sparse()
+        source = self.demonstrations()
         if encoder.training is not None:
             return self._training(encoder.name, encoder.training, seed, source, *encoder.flags)
         name = f"seed_{seed}/{encoder.name}"
@@ -165,7 +152,7 @@ class Plan:
         return Checkpoint(stage, path)
 
     def _latents(self, encoder: Encoder, seed: int) -> Dataset:
-        source, checkpoint = self.demonstrations.sparse(), self._encoder(encoder, seed)
+        source, checkpoint = self.demonstrations(), self._encoder(encoder, seed)
         name = f"seed_{seed}/latents_{encoder.name}"
         folder, repo_id = self.output_dir / name, f"local/{self.preset.name}_{encoder.name}_{seed}"
         flags = {"world_model_path": checkpoint.path, **source.flags()}
@@ -187,7 +174,7 @@ class Plan:
             dataset = self._latents(arm.encoder, seed)
             flags.append(f"--policy.world_model_path={self._encoder(arm.encoder, seed).path}")
         else:
-            dataset = self.demonstrations.dense() if arm.dense_reward else self.demonstrations.sparse()
+            dataset = self.dense_demonstrations() if arm.dense_reward else self.demonstrations()
         if task is not None:
             # A collection's episodes are in the order of its tasks, the same number for each.
             count, position = self.preset.episodes_per_task, self.preset.task_names.index(task)

@@ -14,7 +14,7 @@ from benchmarks import memory
 from benchmarks.environments import OWN, PINS
 from benchmarks.measure import SideError, Spread, check_losses, measure_row, speed_up
 from benchmarks.rows import ROWS, Row, Side
-from benchmarks.sides import agent_settings
+from benchmarks.sides import shared
 from benchmarks.table import number
 from benchmarks.timing import rate
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
@@ -181,13 +181,13 @@ def test_every_side_exists_and_takes_its_rows_sizes() -> None:
 
 def test_peers_have_the_settings_of_our_policies() -> None:
     for config in (WMIQLConfig(device="cpu"), WMBCConfig(device="cpu")):
-        assert config.hidden_dims == agent_settings.HIDDEN_DIMS
-        assert config.dropout == agent_settings.DROPOUT
-        assert config.lr == agent_settings.LEARNING_RATE
+        assert config.hidden_dims == shared.HIDDEN_DIMS
+        assert config.dropout == shared.DROPOUT
+        assert config.lr == shared.LEARNING_RATE
     config = WMIQLConfig(device="cpu")
     assert (config.iql.beta, config.iql.expectile, config.iql.discount, config.iql.target_rate) == (
-        *(agent_settings.BETA, agent_settings.EXPECTILE),
-        *(agent_settings.DISCOUNT, agent_settings.TARGET_RATE),
+        *(shared.BETA, shared.EXPECTILE),
+        *(shared.DISCOUNT, shared.TARGET_RATE),
     )
 
 

@@ -19,7 +19,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 
 from lerobot_wm.cli import expand_home
 from lerobot_wm.collect.command import CollectConfig, collect, plan_shards
-from lerobot_wm.commands.doctor import check_disk
+from lerobot_wm.commands.doctor import check_folder
 from lerobot_wm.data.cache import CACHE_VARIABLE, cache_root
 from lerobot_wm.data.check import DatasetError, read_file
 from lerobot_wm.data.source import open_dataset
@@ -255,7 +255,7 @@ def test_collect_looks_first_at_the_cache_that_merging_needs(
 
 
 def test_doctor_finds_a_folder_that_cannot_be_written(unwritable: Path) -> None:
-    check = check_disk("disk", unwritable)
+    check = check_folder("disk", unwritable)
     assert check.is_broken
     assert str(unwritable.parent) in check.fix
 

@@ -69,9 +69,8 @@ def test_a_discovery_that_dies_without_a_word_is_reported(monkeypatch: pytest.Mo
     assert check.found == "ended with signal or code -9"
 
 
-def test_full_disk_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(doctor, "MIN_FREE_GB", 1e9)
-    assert doctor.check_disk("disk", tmp_path / "not" / "there").is_broken
+def test_full_disk_is_reported(tmp_path: Path) -> None:
+    assert doctor.check_folder("disk", tmp_path / "not" / "there", free_gb=1e9).is_broken
 
 
 def test_optional_parts_never_fail_the_command() -> None:
