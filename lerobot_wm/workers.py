@@ -30,7 +30,7 @@ def map_in_workers[Item, Result](
         function: A module-level function, because worker processes find it by its name.
         items: Its arguments.
         num_workers: Number of processes, at most one for each item; up to one, this process does the work.
-        start: Called first in each process.
+        start: Called first in each new process.
         *start_args: Arguments of `start`.
 
     Raises:

@@ -24,6 +24,7 @@ from lerobot_wm.files import appears_whole
 from lerobot_wm.policies.common.checkpoint import open_checkpoint
 from lerobot_wm.records import (
     Record,
+    group_by_task,
     is_in_split,
     new_records,
     present_splits,
@@ -52,9 +53,9 @@ def _run_in_worker(task: str) -> list[Record]:
 
 def _rollouts(cfg: EvaluateConfig, tasks: list[str]) -> Iterator[list[Record]]:
     """Records task by task, in the order of `tasks`; with one process, the policy is loaded when this returns."""
-    if cfg.num_workers <= 1:
-        return map(TaskRunner(cfg).run, tasks)
     workers = min(cfg.num_workers, len(tasks))
+    if workers <= 1:
+        return map(TaskRunner(cfg).run, tasks)
     threads = max(1, usable_cores() // workers)
     # LeRobot's progress bars of several processes would overwrite each other and the parent's. tqdm reads this variable
     # when a worker imports it, and shows no bar before so many seconds.
@@ -109,17 +110,17 @@ def _write_records(cfg: EvaluateConfig, tasks: list[str]) -> list[Record]:
 
 def _write_info(cfg: EvaluateConfig, records: list[Record], seconds: float) -> None:
     """Write eval_info.json: success rates with intervals per task, split and overall, and their provenance."""
-    tasks = dict.fromkeys(record["task"] for record in records)
+    by_split = {
+        split: summarize_success(r for r in records if is_in_split(r, split))
+        for split in present_splits(records)
+    }
+    overall = by_split.pop("all")
     info = {
         "arm": cfg.arm_name,
         "policy_path": str(cfg.policy.pretrained_path),
-        "per_task": {task: summarize_success(r for r in records if r["task"] == task) for task in tasks},
-        **{
-            "overall" if split == "all" else split: summarize_success(
-                r for r in records if is_in_split(r, split)
-            )
-            for split in present_splits(records)
-        },
+        "per_task": {task: summarize_success(rows) for task, rows in group_by_task(records).items()},
+        **by_split,
+        "overall": overall,
         "eval_s": seconds,
         "provenance": provenance(),
     }
