@@ -14,7 +14,7 @@ from rich.table import Column, Table
 from lerobot_wm.constants import RECORDS_NAME, REPORTED_VARIATION_SET, VARIATION_SETS
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import CONFIGS, Preset, load_preset, select_runs, write_settings
-from lerobot_wm.experiment.runner import Progress, Runner, Times, environment, minutes_left, minutes_text
+from lerobot_wm.experiment.runner import Runner, Times, environment, minutes_left, minutes_text
 from lerobot_wm.experiment.stage import Stage, in_order, lerobot_wm, unfinished
 from lerobot_wm.files import sole_writer, write_whole
 from lerobot_wm.records import Record, read_records, record_line
@@ -190,16 +190,15 @@ class Experiment:
             console: Where progress is shown.
         """
         self._record_finished()
-        todo = unfinished(self._targets())
-        with Progress(console, self.times, self.processes, len(todo)) as progress:
-            return Runner(
-                todo,
-                self.processes,
-                usable_cores(),
-                self.times,
-                progress,
-                on_finish=lambda stage: self._record_finished(),
-            ).run(lock)
+        runner = Runner(
+            unfinished(self._targets()),
+            self.processes,
+            usable_cores(),
+            self.times,
+            console,
+            on_finish=lambda stage: self._record_finished(),
+        )
+        return runner.run(lock)
 
     def report(self) -> bool:
         """Write the records and the report if anything is finished, and return whether that succeeded."""

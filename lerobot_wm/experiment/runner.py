@@ -134,57 +134,6 @@ def environment(cores: int) -> dict[str, str]:
     return variables
 
 
-class Progress:
-    """Prints a line when a stage starts or ends, and on a terminal a live view below. A context manager."""
-
-    def __init__(self, console: Console, times: Times, processes: int, total: int) -> None:
-        self._console = console
-        self._times = times
-        self._processes = processes
-        self._total = total
-        self._done = 0
-        self._live = Live(console=console, refresh_per_second=2, transient=True)
-
-    def __enter__(self) -> "Progress":
-        if self._console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._live.stop()
-
-    def started(self, stage: Stage) -> None:
-        """Print that a stage starts or resumes."""
-        verb = "resumes" if stage.is_resumable else "starts"
-        self._console.print(f"{stage.name} {verb}; log: {stage.log}", highlight=False, soft_wrap=True)
-
-    def finished(self, stage: Stage, seconds: float) -> None:
-        """Print that a stage succeeded."""
-        self._done += 1
-        self._console.print(
-            f"[green]{stage.name} done[/] in {minutes_text(seconds / 60)} ({self._done}/{self._total})",
-            highlight=False,
-        )
-
-    def failed(self, stage: Stage, returncode: int) -> None:
-        """Print that a stage failed."""
-        why = f"exit code {returncode}" if returncode else f"it did not write {stage.artefact}"
-        self._console.print(f"[red]{stage.name} failed[/] ({why})", highlight=False, soft_wrap=True)
-
-    def show(self, running: Sequence[StageProcess], waiting: Mapping[str, Stage]) -> None:
-        """Update the live view."""
-        minutes = {name: self._times.minutes(stage.kind) for name, stage in waiting.items()}
-        table = Table("running", "minutes", "of about", box=None)
-        for work in running:
-            expected, spent = self._times.minutes(work.stage.kind), work.seconds / 60
-            table.add_row(work.stage.name, f"{spent:.1f}", f"{expected:.1f}")
-            minutes[work.stage.name] = max(0.0, expected - spent)
-        stages = {work.stage.name: work.stage for work in running} | dict(waiting)
-        left = minutes_left(stages, minutes, self._processes)
-        state = f"{self._done} of {self._total} stages done, {len(waiting)} waiting; about {minutes_text(left)} left"
-        self._live.update(Group(table, Text(state)))
-
-
 def minutes_text(minutes: float) -> str:
     """3.2 -> "3.2 min", 72 -> "1 h 12 min"."""
     return f"{minutes:.1f} min" if minutes < 60 else f"{minutes // 60:.0f} h {minutes % 60:.0f} min"
@@ -194,14 +143,14 @@ POLL_SECONDS = 0.2
 
 
 class Runner:
-    """Runs stages as subprocesses.
+    """Runs stages as subprocesses; prints when one starts or ends, and on a terminal shows those that run.
 
     Args:
         stages: Unfinished ones by name, each after those it needs.
         processes: How many run side by side at most.
         cores: Cores of the machine, shared by the stages that run side by side.
         times: Measured and expected wall times.
-        progress: Shows the progress.
+        console: Where progress is shown.
         on_finish: Called after each stage that succeeds.
     """
 
@@ -211,16 +160,17 @@ class Runner:
         processes: int,
         cores: int,
         times: Times,
-        progress: Progress,
+        console: Console,
         on_finish: Callable[[Stage], None],
     ) -> None:
+        self._total, self._done = len(stages), 0
         self._waiting = dict(stages)
         self._running: list[StageProcess] = []
         self._failed: list[Stage] = []
         self._processes = processes
         self._cores = cores
         self._times = times
-        self._progress = progress
+        self._console = console
         self._on_finish = on_finish
         self._ranks = ranks(stages, {name: times.minutes(stage.kind) for name, stage in stages.items()})
 
@@ -233,13 +183,14 @@ class Runner:
             lock: A file that every stage holds open.
         """
         try:
-            while True:
-                self._reap()
-                self._start_ready(lock)
-                if not self._running:
-                    return self._failed
-                self._progress.show(self._running, self._waiting)
-                time.sleep(POLL_SECONDS)
+            with Live(console=self._console, refresh_per_second=2, transient=True) as live:
+                while True:
+                    self._reap()
+                    self._start_ready(lock)
+                    if not self._running:
+                        return self._failed
+                    live.update(self._progress())
+                    time.sleep(POLL_SECONDS)
         finally:
             stop(self._running)
 
@@ -252,22 +203,41 @@ class Runner:
         ready.sort(key=lambda stage: -self._ranks[stage.name])
         side_by_side = min(self._processes, len(self._running) + len(ready))
         for stage in ready[: self._processes - len(self._running)]:
-            self._progress.started(stage)
+            self._print(f"{stage.name} {'resumes' if stage.is_resumable else 'starts'}; log: {stage.log}")
             with delay_signals(signal.SIGINT, signal.SIGTERM):
                 self._running.append(StageProcess(stage, max(1, self._cores // side_by_side), lock))
             del self._waiting[stage.name]
 
     def _reap(self) -> None:
         for work in list(self._running):
-            returncode = work.process.poll()
+            stage, returncode = work.stage, work.process.poll()
             if returncode is None:
                 continue
             self._running.remove(work)
-            if returncode == 0 and work.stage.is_finished:
+            if returncode == 0 and stage.is_finished:
+                self._done += 1
                 if not work.resumed:
-                    self._times.record(work.stage, work.seconds)
-                self._progress.finished(work.stage, work.seconds)
-                self._on_finish(work.stage)
+                    self._times.record(stage, work.seconds)
+                took = minutes_text(work.seconds / 60)
+                self._print(f"[green]{stage.name} done[/] in {took} ({self._done}/{self._total})")
+                self._on_finish(stage)
             else:
-                self._failed.append(work.stage)
-                self._progress.failed(work.stage, returncode)
+                self._failed.append(stage)
+                why = f"exit code {returncode}" if returncode else f"it did not write {stage.artefact}"
+                self._print(f"[red]{stage.name} failed[/] ({why})")
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, highlight=False, soft_wrap=True)
+
+    def _progress(self) -> Group:
+        """The running stages, and how long the rest will take."""
+        minutes = {name: self._times.minutes(stage.kind) for name, stage in self._waiting.items()}
+        table = Table("running", "minutes", "of about", box=None)
+        for work in self._running:
+            expected, spent = self._times.minutes(work.stage.kind), work.seconds / 60
+            table.add_row(work.stage.name, f"{spent:.1f}", f"{expected:.1f}")
+            minutes[work.stage.name] = max(0.0, expected - spent)
+        stages = {work.stage.name: work.stage for work in self._running} | self._waiting
+        left = minutes_text(minutes_left(stages, minutes, self._processes))
+        state = f"{self._done} of {self._total} stages done, {len(self._waiting)} waiting; about {left} left"
+        return Group(table, Text(state))

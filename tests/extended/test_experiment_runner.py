@@ -1,7 +1,9 @@
 """Stages of the experiment as real subprocesses: order, failure, stopping and resuming."""
 
+import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,7 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from lerobot_wm.experiment.runner import Progress, Runner, Times, minutes_left, ranks
+from lerobot_wm.experiment.runner import Runner, Times, minutes_left, ranks
 from lerobot_wm.experiment.stage import Stage, in_order, unfinished
 from lerobot_wm.files import sole_writer
 
@@ -37,11 +39,11 @@ def stage(
 
 
 class Shown:
-    """What a run did: stages started, finished and failed, in order."""
+    """What a run did: stages started and finished, in order."""
 
-    def __init__(self) -> None:
-        self.started: list[str] = []
-        self.finished: list[str] = []
+    def __init__(self, printed: str, finished: list[str]) -> None:
+        self.started = re.findall(r"^(\S+) (?:starts|resumes);", printed, re.MULTILINE)
+        self.finished = finished
 
 
 def run(
@@ -53,26 +55,13 @@ def run(
 ) -> tuple[Shown, list[str]]:
     """Run what is unfinished; returns what was seen and the names of the stages that failed."""
     times = Times(folder / "times.json", minutes or {"kind": 1.0})
-    stages = unfinished(targets)
-    console = Console(file=(folder / "console").open("a"), width=200)
-    shown = Shown()
-
-    class Noting(Progress):
-        def started(self, stage: Stage) -> None:
-            shown.started.append(stage.name)
-            super().started(stage)
-
-    with Noting(console, times, processes, len(stages)) as progress, sole_writer(folder) as lock:
-        runner = Runner(
-            stages,
-            processes,
-            cores,
-            times,
-            progress,
-            on_finish=lambda stage: shown.finished.append(stage.name),
-        )
+    console, finished = Console(file=io.StringIO(), width=200), []
+    runner = Runner(
+        unfinished(targets), processes, cores, times, console, lambda stage: finished.append(stage.name)
+    )
+    with sole_writer(folder) as lock:
         failed = runner.run(lock)
-    return shown, [stage.name for stage in failed]
+    return Shown(console.file.getvalue(), finished), [stage.name for stage in failed]
 
 
 def wait_until(condition: Callable[[], object], seconds: float = 240.0) -> None:
@@ -192,7 +181,7 @@ RUN = """
 import signal, sys
 from pathlib import Path
 from rich.console import Console
-from lerobot_wm.experiment.runner import Progress, Runner, Times
+from lerobot_wm.experiment.runner import Runner, Times
 from lerobot_wm.experiment.stage import Stage
 from lerobot_wm.files import sole_writer
 for number in (signal.SIGINT, signal.SIGTERM):  # a shell lets its background jobs ignore SIGINT
@@ -204,8 +193,8 @@ for name in "ab":
     argv = (sys.executable, "-c", SLEEP, str(folder / f"{name}.pid"))
     stages[name] = Stage(name, "kind", argv, folder / name, folder / name / "done")
 times = Times(folder / "times.json", {"kind": 1.0})
-with sole_writer(folder) as lock, Progress(Console(), times, 2, 2) as progress:
-    Runner(stages, 2, 2, times, progress, on_finish=print).run(lock)
+with sole_writer(folder) as lock:
+    Runner(stages, 2, 2, times, Console(), on_finish=print).run(lock)
 """
 
 
