@@ -9,9 +9,11 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 
 import torch
 from lerobot.configs import parser
+from lerobot.policies import make_policy
 from lerobot.utils.utils import init_logging
 from rich.console import Console
 from tqdm import tqdm
@@ -22,6 +24,7 @@ from lerobot_wm.evaluate.rollouts import TaskRunner, task_names
 from lerobot_wm.evaluate.wandb_log import log_evaluation, wandb_run
 from lerobot_wm.files import appears_whole
 from lerobot_wm.policies.common.checkpoint import open_checkpoint
+from lerobot_wm.policies.common.config import PolicyConfig
 from lerobot_wm.records import (
     Record,
     group_by_task,
@@ -77,6 +80,9 @@ def evaluate(cfg: EvaluateConfig) -> list[Record]:
     path, revision = cfg.policy.pretrained_path, cfg.policy.pretrained_revision
     with new_records(cfg.records_file):
         open_checkpoint(path, revision)
+        if isinstance(cfg.policy, PolicyConfig):
+            # Ours are small: one that does not fit is found before environments are built.
+            make_policy(deepcopy(cfg.policy), env_cfg=cfg.env, rename_map=cfg.rename_map)
         tasks = task_names(cfg)
         with wandb_run(cfg.wandb, path, cfg.output_dir, revision) as run:
             records = _write_records(cfg, tasks)

@@ -31,11 +31,10 @@ class TaskRunner:
         self.device = get_safe_torch_device(cfg.policy.device)
         trained = training_config(cfg.policy.pretrained_path, cfg.policy.pretrained_revision)
         self.training_seed = trained.get("seed")
-        # Before the environments, which take longer: a damaged policy is found first.
-        self.policy = make_policy(cfg=cfg.policy, env_cfg=cfg.env, rename_map=cfg.rename_map).eval()
         # One vector environment per batch size, so that a shorter last batch runs no other seeds.
         sizes = {len(seeds) for seeds in self._batches()}
         self.envs = {size: make_task_envs(cfg, size) for size in sizes}
+        self.policy = make_policy(cfg=cfg.policy, env_cfg=cfg.env, rename_map=cfg.rename_map).eval()
         preprocessor, postprocessor = make_pre_post_processors(
             policy_cfg=cfg.policy,
             pretrained_path=cfg.policy.pretrained_path,
