@@ -139,7 +139,7 @@ CASES: list[tuple[str, str, tuple[str, ...]]] = [
         "",
         (EVAL % "wm_bc").replace("--policy.path=", "--policy.type=wm_bc --policy.world_model_path=")
         + "--env.task=reach-v3",
-        ("--policy.type=wm_bc", "--policy.path="),
+        ("--policy.path=",),
     ),
 ]
 
