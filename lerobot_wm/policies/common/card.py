@@ -132,6 +132,8 @@ def model_card(
     policy_class = get_policy_class(config.type)
     makes_latents = not config.chooses_actions
     settings = draccus.encode(config)
+    # A policy on latents holds the world model's settings.
+    rssm = settings.get("rssm") or (settings.get("world_model") or {}).get("rssm") or {}
     datasets = [data.latents.source_repo_id if data.latents else data.repo_id] if data else None
     metadata = ModelCardData(
         license=config.license or "apache-2.0",
@@ -150,6 +152,7 @@ def model_card(
         class_name=policy_class.__name__,
         example=Markdown(_example(config, settings)),
         evaluation=None if makes_latents else Markdown(eval_command(config, repo_id)),
+        hidden_action_share=rssm.get("hidden_action_share"),
         action_shape=(1, *config.output_features[ACTION].shape),
         inputs={key: tuple(config.input_features[key].shape) for key in config.features_read},
         run=cfg,

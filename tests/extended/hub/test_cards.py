@@ -16,6 +16,7 @@ from lerobot_wm.policies.frozen_backbone.configuration_frozen_backbone import Fr
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.records import Record
+from lerobot_wm.world_model.config import RSSMConfig
 
 NASTY = [
     "---\nlicense: mit\n---",
@@ -135,6 +136,19 @@ def test_records_of_another_policy_are_refused(other: dict, said: str) -> None:
     check_records([RECORD], "wm_bc", 0)
     with pytest.raises(ValueError, match=said):
         check_records([RECORD, {**RECORD, **other}], "wm_bc", 0)
+
+
+@pytest.mark.parametrize("is_target", [True, False])
+def test_how_targets_were_learned_is_on_the_card(is_target: bool) -> None:
+    rssm = RSSMConfig(hidden_action_share=0.25 if is_target else 0.0)
+    world_model = WMRSSMConfig(device="cpu", image_key="observation.image", rssm=rssm)
+    config = WMBCConfig(device="cpu", world_model=world_model, relative_indices=[0, 2] if is_target else [])
+    config.input_features = features("VISUAL", "observation.image", (3, 64, 64))
+    config.output_features = features("ACTION", "action", (3,))
+    world_model.input_features, world_model.output_features = config.input_features, config.output_features
+    for of, facts in ((config, ("2 of the action's 3", "25%")), (world_model, ("25%",))):
+        card = str(model_card(of, "user/x", None, None))
+        assert [fact in card for fact in facts] == [is_target] * len(facts)
 
 
 def test_a_backbones_card_names_what_it_reads() -> None:
