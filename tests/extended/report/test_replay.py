@@ -15,10 +15,16 @@ from lerobot_wm.inspect.replay import HOLD, OWN, RECORDED, REPEAT, ReplayConfig,
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
-ACT = "--policy.type=act --policy.chunk_size=4 --policy.n_action_steps=4 --policy.dim_model=16 --policy.n_heads=2"
-SMALL = (
+# LeRobot's own policies, at a small size.
+ACT = (
+    "--policy.type=act --policy.chunk_size=4 --policy.n_action_steps=4 --policy.dim_model=16 --policy.n_heads=2 "
     "--policy.dim_feedforward=16 --policy.n_encoder_layers=1 --policy.use_vae=false "
     "--policy.pretrained_backbone_weights=null"
+)
+DIFFUSION = (
+    "--policy.type=diffusion --policy.horizon=8 --policy.n_action_steps=4 --policy.down_dims=[16,32] "
+    "--policy.n_groups=4 --policy.diffusion_step_embed_dim=16 --policy.num_train_timesteps=4 "
+    "--policy.spatial_softmax_num_keypoints=4 --policy.pretrained_backbone_weights=null --policy.use_group_norm=true"
 )
 
 
@@ -57,7 +63,12 @@ def test_own_actions_are_those_of_a_rollout_and_recorded_ones_those_of_the_laten
     assert result.in_std(result.errors(f"{name}, {OWN}", [1])) == pytest.approx(error, abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("flags", "needs"), [(ACT, None), (DIFFUSION, "diffusers")], ids=["act", "diffusion"]
+)
 def test_the_command_compares_policies_on_what_was_held_out(
+    flags: str,
+    needs: str | None,
     demos: LeRobotDataset,
     demos_root: Path,
     lerobot_wm_command: Callable[..., None],
@@ -65,24 +76,32 @@ def test_the_command_compares_policies_on_what_was_held_out(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    if needs is not None:
+        pytest.importorskip(needs, reason="pip install 'lerobot[diffusion]'")
     data = DATASET_FLAGS.format(root=demos_root)
     train = f"--steps=4 --batch_size=8 {TRAIN_FLAGS} {data} --dataset.eval_split=0.25"
     lerobot_wm_command(
         f"train --policy.type=wm_bc --policy.use_latent=false {train} --output_dir={tmp_path / 'blind'}"
     )
-    lerobot_train_command(f"{ACT} {SMALL} {train} --output_dir={tmp_path / 'act'}")
-    blind, act = (tmp_path / run / "checkpoints/last/pretrained_model" for run in ("blind", "act"))
+    lerobot_train_command(f"{flags} {train} --output_dir={tmp_path / 'other'}")
+    blind, other = (tmp_path / run / "checkpoints/last/pretrained_model" for run in ("blind", "other"))
     # The last of each task's four episodes.
     assert set(range(8)) - trained_episodes(str(blind), demos.meta) == {3, 7}
     capsys.readouterr()
     lerobot_wm_command(
-        f"replay --policy.path={blind} --compare=[{act}] {data} --output_dir={tmp_path / 'replay'}"
+        f"replay --policy.path={blind} --compare=[{other}] {data} --output_dir={tmp_path / 'replay'}"
     )
     printed = capsys.readouterr().out
     assert "blind" in printed
-    assert "act" in printed
+    assert "other" in printed
     result = json.loads((tmp_path / "replay" / "replay.json").read_text())
-    assert set(result["error_in_std"]) == {f"blind, {OWN}", f"blind, {RECORDED}", f"act, {OWN}", REPEAT, HOLD}
+    assert set(result["error_in_std"]) == {
+        f"blind, {OWN}",
+        f"blind, {RECORDED}",
+        f"other, {OWN}",
+        REPEAT,
+        HOLD,
+    }
     assert {(row["episode"], row["held_out"]) for row in result["episodes"]} == {(3, True), (7, True)}
     # A policy without memory is told nothing.
     assert result["error_in_std"][f"blind, {OWN}"] == result["error_in_std"][f"blind, {RECORDED}"]
