@@ -28,7 +28,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("lerobot_wm.train.command", "lerobot-train with its flags, fed from RAM or GPU memory"),
     "encode": ("lerobot_wm.encode.command", "image dataset + frozen world model -> latent LeRobotDataset"),
     "eval": ("lerobot_wm.evaluate.command", "lerobot-eval with its flags, one record per rollout"),
-    "report": ("lerobot_wm.report.command", "records -> success table and self-contained HTML page"),
+    "report": (
+        "lerobot_wm.report.command",
+        "data, curves, dreams, replay, records -> self-contained HTML page",
+    ),
     "quality": ("lerobot_wm.inspect.quality", "how good a world model is on unseen positions"),
     "dream": (
         "lerobot_wm.inspect.dream_command",

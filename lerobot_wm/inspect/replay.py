@@ -37,6 +37,7 @@ from lerobot_wm.system import quiet, silence
 from lerobot_wm.tables import Measurement, ReportTable, terminal_tables
 
 OWN, RECORDED = "own actions fed back", "recorded actions fed back"
+REPLAY_NAME = "replay.json"
 HOLD, REPEAT = "hold the state", "repeat the last recorded action"
 # Frames of full size that are decoded together.
 _FRAMES_AT_ONCE = 16
@@ -277,25 +278,26 @@ def _names(paths: list[str]) -> list[str]:
     return runs if len(set(runs)) == len(runs) else paths
 
 
-def replay_table(result: Replay) -> ReportTable:
-    """Mean absolute error in standard deviations of the action; beside it that of the worst joint."""
-    rows = []
-    for label in result.actions:
-        cells = []
-        for episodes in result.groups.values():
-            errors = result.in_std(result.errors(label, episodes))
-            cells.append(Measurement(f"{errors.mean():.3f}", f"worst {errors.max():.2f}"))
-        rows.append((label, cells))
-    counts = {name: len(episodes) for name, episodes in result.groups.items()}
+def replay_table(content: dict[str, Any]) -> ReportTable:
+    """The table of a replay.json: policies and references down, held-out and trained episodes across."""
+    rows = [
+        (
+            label,
+            [Measurement(f"{mean:.3f}", f"worst {worst:.2f}") for mean, worst in zip(*cells, strict=True)],
+        )
+        for label, means in content["error_in_std"].items()
+        for cells in [(means.values(), content["worst_joint_in_std"][label].values())]
+    ]
+    counts = content["n_episodes"]
     notes = [
-        "Mean absolute error of the action in standard deviations of the dataset's actions; in brackets that of the "
+        "Mean absolute error of the action in standard deviations of the dataset's actions; beside it that of the "
         f"joint that is furthest off. Episodes: {', '.join(f'{n} {name}' for name, n in counts.items())}."
     ]
     return ReportTable("Replay of recorded episodes", "policy", list(counts), rows, notes=notes)
 
 
 def as_json(result: Replay) -> dict[str, Any]:
-    """Errors of each policy, episode and joint, in units and in standard deviations."""
+    """The content of replay.json: errors of each policy, episode and joint, in units and in standard deviations."""
     rows = [
         {
             "policy": label,
@@ -309,15 +311,24 @@ def as_json(result: Replay) -> dict[str, Any]:
         for episode in result.recorded
         for errors in [result.errors(label, [episode])]
     ]
-    means = {
+    in_std = {
         label: {
-            name: float(result.in_std(result.errors(label, episodes)).mean())
-            for name, episodes in result.groups.items()
+            name: result.in_std(result.errors(label, episodes)) for name, episodes in result.groups.items()
         }
         for label in result.actions
     }
     std = dict(zip(result.joints, map(float, result.std), strict=True))
-    return {"error_in_std": means, "action_std": std, "episodes": rows}
+    return {
+        "error_in_std": {
+            label: {name: float(e.mean()) for name, e in g.items()} for label, g in in_std.items()
+        },
+        "worst_joint_in_std": {
+            label: {name: float(e.max()) for name, e in g.items()} for label, g in in_std.items()
+        },
+        "n_episodes": {name: len(episodes) for name, episodes in result.groups.items()},
+        "action_std": std,
+        "episodes": rows,
+    }
 
 
 def replay_figure(result: Replay, episode: int, fps: float) -> Figure:
@@ -356,8 +367,7 @@ def main() -> None:
     for episode in result.recorded:
         figure = replay_figure(result, episode, fps)
         (cfg.output_dir / f"episode_{episode}.png").write_bytes(figure_bytes(figure, PNG))
-    write_whole(cfg.output_dir / "replay.json", json.dumps(as_json(result), indent=1))
-    console = Console(width=100)
-    for part in terminal_tables(replay_table(result)):
-        console.print(part)
-    print(f"Errors of each joint: {cfg.output_dir / 'replay.json'}; figures beside it.")
+    content = as_json(result)
+    write_whole(cfg.output_dir / REPLAY_NAME, json.dumps(content, indent=1))
+    Console(width=100).print(*terminal_tables(replay_table(content)))
+    print(f"Errors of each joint: {cfg.output_dir / REPLAY_NAME}; figures beside it.")

@@ -1,4 +1,4 @@
-"""`lerobot-wm report`: records -> success tables in the terminal and one self-contained HTML page."""
+"""`lerobot-wm report`: one self-contained HTML page of what there is: data, curves, models, success of rollouts."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +13,10 @@ from lerobot_wm.inspect.latent_map import latent_figures, latent_map
 from lerobot_wm.inspect.open_loop import open_loop, psnr_table, strips_figure
 from lerobot_wm.inspect.pictures import PNG, SVG, data_uri, figure_bytes, figure_uri
 from lerobot_wm.records import COMMAND, find_records, provenance, read_records
+from lerobot_wm.report.models import dream_clips, read_quality, read_replay
 from lerobot_wm.report.page import Page, page_of_records
 from lerobot_wm.report.rollouts import read_evaluation
 from lerobot_wm.report.training import curve_figures, read_logs, summarise_data
-from lerobot_wm.report.world_model import dream_clips, read_quality
 from lerobot_wm.tables import markdown_table, terminal_tables
 
 TERMINAL_WIDTH = 100
@@ -24,21 +24,22 @@ TERMINAL_WIDTH = 100
 
 @dataclass
 class ReportConfig:
-    """Flags of `lerobot-wm report`; lists are separated by commas.
+    """Flags of `lerobot-wm report`; lists are separated by commas. Each adds a section to the page.
 
     Args:
         records: Records files of `lerobot-wm eval`, or globs.
         output_dir: Where the page and its tables are written.
         title: The page's title.
-        videos: Output folders of `lerobot-wm eval` whose videos are shown.
+        videos: Output folders of `lerobot-wm eval` whose videos are shown; needs `records`.
         train_logs: Output folders of `lerobot-wm train` whose curves are shown.
         world_model_path: Checkpoint of wm_rssm, wm_bc or wm_iql whose dreams, predictions and latents of `dataset` are
             shown.
         dataset: The dataset that is described, and that the world model is shown.
-        quality: quality.json of `lerobot-wm quality`, which is included.
+        quality: quality.json of `lerobot-wm quality`.
+        replay: replay.json of `lerobot-wm replay`.
     """
 
-    records: str
+    records: str | None = None
     output_dir: Path = Path("outputs/report")
     title: str = "World-model policies"
     videos: str | None = None
@@ -46,10 +47,11 @@ class ReportConfig:
     world_model_path: str | None = None
     dataset: SourceConfig | None = None
     quality: Path | None = None
+    replay: Path | None = None
 
 
 def report(cfg: ReportConfig) -> Path:
-    """Print the success tables; write `index.html`, `success.md` and, with a world model, `open_loop.png`.
+    """Print the tables; write `index.html`, with records `success.md`, and with a world model `open_loop.png`.
 
     Returns:
         The page.
@@ -68,26 +70,35 @@ def report(cfg: ReportConfig) -> Path:
             )
         policy = load_world_model(cfg.world_model_path)
         check_features(policy, meta)
-    records = read_records(find_records(cfg.records))
     evaluations = [read_evaluation(folder) for folder in _paths(cfg.videos)]
-    page = page_of_records(
-        cfg.title, records, [clip for evaluation in evaluations for clip in evaluation.clips]
-    )
+    page = Page(cfg.title)
+    if cfg.records is not None:
+        clips = [clip for evaluation in evaluations for clip in evaluation.clips]
+        page = page_of_records(cfg.title, read_records(find_records(cfg.records)), clips)
     page.made_by = _group_by_machine([*(evaluation.provenance for evaluation in evaluations), provenance()])
     page.curves = [figure_uri(figure, SVG) for figure in curve_figures(read_logs(_paths(cfg.train_logs)))]
     if cfg.quality is not None:
         page.quality = read_quality(cfg.quality)
+    if cfg.replay is not None:
+        page.replay = read_replay(cfg.replay)
+    if cfg.dataset is None and list(page.sections) == ["provenance"]:
+        raise ValueError(
+            "There is nothing to show: give --records (with or without --videos), --train_logs, --replay, --quality or "
+            "--dataset.repo_id."
+        )
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     if cfg.dataset is not None and meta is not None:
         page.data = summarise_data(meta, cfg.dataset)
         if policy is not None:
             _show_world_model(page, policy, meta, cfg.dataset, cfg.output_dir)
 
-    tables = [*page.tables, *([page.paper_table] if page.paper_table else []), *page.comparison_tables]
+    success = [*page.tables, *([page.paper_table] if page.paper_table else []), *page.comparison_tables]
     console = Console(width=TERMINAL_WIDTH)
-    for table in tables:
+    for table in [*success, *([page.replay.table] if page.replay else [])]:
         console.print(*terminal_tables(table))
-    (cfg.output_dir / "success.md").write_text("".join(map(markdown_table, [*tables, *page.detail_tables])))
+    if success:
+        markdown = "".join(map(markdown_table, [*success, *page.detail_tables]))
+        (cfg.output_dir / "success.md").write_text(markdown)
     index = cfg.output_dir / "index.html"
     index.write_text(page.html())
     return index

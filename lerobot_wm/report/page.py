@@ -13,6 +13,7 @@ from lerobot_wm.inspect.pictures import SVG, figure_uri, shorten
 from lerobot_wm.records import Estimate, Record, SuccessRate, is_in_split, present_splits, success_rate
 from lerobot_wm.report.arms import ARMS
 from lerobot_wm.report.comparison import group_by_arm
+from lerobot_wm.report.models import DreamClip, ReplaySummary
 from lerobot_wm.report.rollouts import MAX_VIDEO_BYTES, Clip, Grid, make_grids, within_limit
 from lerobot_wm.report.success import (
     comparison_tables,
@@ -22,7 +23,6 @@ from lerobot_wm.report.success import (
     task_table,
 )
 from lerobot_wm.report.training import DataSummary
-from lerobot_wm.report.world_model import DreamClip
 from lerobot_wm.tables import Measurement, ReportTable, cell_text
 
 SPLIT_COLOURS = {"seen": "#e08214", "unseen": "#2f6fde"}
@@ -34,8 +34,8 @@ class Page:
 
     Attributes:
         title: The page's title.
-        arms: Each arm, its preset, and what it is.
-        n_rollouts: How many records there are.
+        arms: Each arm of the rollouts, its preset, and what it is.
+        n_rollouts: How many records of rollouts there are.
         tables, detail_tables, paper_table, comparison_tables: Success rates.
         grids: Which variations succeed and fail.
         split_picture: Success on seen and on unseen variations, a data URI.
@@ -43,6 +43,7 @@ class Page:
         n_clips: How many videos are on the page, and how many there were.
         made_by: Commands, each list with the versions and the kind of machine they ran with.
         data: The dataset that is described.
+        replay: How far policies are from recorded actions.
         dataset: Repo id of the dataset that the world model is shown.
         dreams: Dreams of some of its episodes.
         open_loop, strips: The table of open-loop prediction, and its picture as a data URI.
@@ -52,18 +53,19 @@ class Page:
     """
 
     title: str
-    arms: list[tuple[str, str, str]]
-    n_rollouts: int
-    tables: list[ReportTable]
-    detail_tables: list[ReportTable]
-    paper_table: ReportTable | None
-    comparison_tables: list[ReportTable]
-    grids: list[Grid]
+    arms: list[tuple[str, str, str]] = field(default_factory=list)
+    n_rollouts: int = 0
+    tables: list[ReportTable] = field(default_factory=list)
+    detail_tables: list[ReportTable] = field(default_factory=list)
+    paper_table: ReportTable | None = None
+    comparison_tables: list[ReportTable] = field(default_factory=list)
+    grids: list[Grid] = field(default_factory=list)
     split_picture: str = ""
     featured: list[Clip] = field(default_factory=list)
     n_clips: tuple[int, int] = (0, 0)
     made_by: list[tuple[list[str], dict[str, str]]] = field(default_factory=list)
     data: DataSummary | None = None
+    replay: ReplaySummary | None = None
     dataset: str = ""
     dreams: list[DreamClip] = field(default_factory=list)
     open_loop: ReportTable | None = None
@@ -77,9 +79,10 @@ class Page:
     def sections(self) -> dict[str, str]:
         """Headings of the sections that have content, by name, in the order of the page."""
         headings = {
-            "data": "What was trained, and on which data",
-            "success": "Success rates",
-            "videos": "Videos, and which variations fail",
+            "data": "What was trained, and on which data" if self.arms else "The data" if self.data else "",
+            "success": "Success rates" if self.tables else "",
+            "videos": "Videos, and which variations fail" if self.grids else "",
+            "replay": "How far the policy is from recorded actions" if self.replay else "",
             "imagination": "What the world model imagines" if self.open_loop or self.dreams else "",
             "knowledge": "What the world model knows" if self.latents or self.quality else "",
             "training": "Training curves" if self.curves else "",
@@ -113,7 +116,7 @@ def template_environment() -> Environment:
 
 
 def page_of_records(title: str, records: list[Record], clips: list[Clip]) -> Page:
-    """What the page shows of the records and of the videos of their rollouts."""
+    """A page of rollouts: what it shows of their records and videos."""
     inlined = within_limit(clips)
     # The first success and the first failure.
     first = {clip.success: clip for clip in reversed(inlined)}

@@ -14,10 +14,12 @@ from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.inspect.open_loop import WINDOW
 from lerobot_wm.inspect.quality import QualityConfig, quality
+from lerobot_wm.inspect.replay import REPLAY_NAME
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.records import Record, record_line
 from lerobot_wm.world_model.config import RSSMConfig
+from tests.flags import DATASET_FLAGS
 
 TASKS = ("reach-v3", "window-close-v3")
 
@@ -111,3 +113,19 @@ def quality_path(demos_root: Path, world_model_path: Path, tmp_path_factory: pyt
     dataset = SourceConfig("test/demos", str(demos_root))
     folder = tmp_path_factory.mktemp("quality")
     return quality(QualityConfig(str(world_model_path), dataset, folder, episodes_per_task=3))
+
+
+@pytest.fixture(scope="session")
+def replay_path(
+    demos_root: Path,
+    policy_paths: dict[str, Path],
+    tmp_path_factory: pytest.TempPathFactory,
+    lerobot_wm_command: Callable[..., None],
+) -> Path:
+    """The replay.json of a policy on one of its training episodes."""
+    folder = tmp_path_factory.mktemp("replay")
+    lerobot_wm_command(
+        f"replay --policy.path={policy_paths['wm_bc']} --episodes=[1] --output_dir={folder}",
+        DATASET_FLAGS.format(root=demos_root),
+    )
+    return folder / REPLAY_NAME

@@ -66,7 +66,9 @@ def write_hostile_run(folder: Path, records: list[Record]) -> ReportConfig:
 
 
 @pytest.fixture(scope="module")
-def index(tmp_path_factory: pytest.TempPathFactory, world_model_path: Path, quality_path: Path) -> Path:
+def index(
+    tmp_path_factory: pytest.TempPathFactory, world_model_path: Path, quality_path: Path, replay_path: Path
+) -> Path:
     """A page with every section."""
     folder = tmp_path_factory.mktemp("browser")
     record_hostile(folder / "data")
@@ -89,6 +91,7 @@ def index(tmp_path_factory: pytest.TempPathFactory, world_model_path: Path, qual
     ]
     config = write_hostile_run(folder, records)
     config.quality = quality_path
+    config.replay = replay_path
     config.world_model_path = str(world_model_path)
     config.dataset = SourceConfig("test/recorded", str(folder / "data"))
     return report(config)
@@ -142,13 +145,13 @@ def phone(index: Path, browser: Browser) -> Iterator[Visit]:
 
 def test_every_section_is_there(desk: Visit) -> None:
     assert desk.page.locator("h2").all_inner_texts() == desk.page.locator("nav a").all_inner_texts()
-    assert desk.page.locator("h2").count() == 7
+    assert desk.page.locator("h2").count() == 8
 
 
 def test_every_picture_and_video_loads(desk: Visit) -> None:
     images, videos = desk.page.locator("img"), desk.page.locator("video[src]")
-    assert images.count() == 2 + 1 + 2 + 1 + 2 + 5 + 2, (
-        "data, seen, dreams, open loop, latents, quality, curves"
+    assert images.count() == 2 + 1 + 1 + 2 + 1 + 2 + 5 + 2, (
+        "data, seen, replay, dreams, open loop, latents, quality, curves"
     )
     desk.page.wait_for_function("Array.from(document.images).every(i => i.complete)")
     assert min(images.evaluate_all("all => all.map(i => i.naturalWidth)")) > 0
@@ -183,7 +186,7 @@ def test_hostile_names_are_text(desk: Visit) -> None:
 def test_the_page_fits_a_phone(phone: Visit) -> None:
     width, scroll = phone.page.evaluate("[innerWidth, document.documentElement.scrollWidth]")
     assert (width, scroll) == (PHONE_WIDTH, PHONE_WIDTH)
-    assert phone.page.locator("h2").count() == 7
+    assert phone.page.locator("h2").count() == 8
     # Tables that are too wide scroll in a box of their own.
     boxes = phone.page.locator(".wide").evaluate_all(
         "all => all.map(b => [b.scrollWidth > b.clientWidth, getComputedStyle(b).overflowX])"

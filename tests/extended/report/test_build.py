@@ -14,7 +14,8 @@ from PIL import Image
 
 from lerobot_wm import cli
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.inspect.pictures import MP4, data_uri
+from lerobot_wm.inspect.pictures import MP4, PNG, data_uri
+from lerobot_wm.inspect.replay import REPEAT
 from lerobot_wm.records import record_line
 from lerobot_wm.report import rollouts
 from lerobot_wm.report.command import ReportConfig, report
@@ -75,6 +76,48 @@ def test_records_alone(
     assert not (tmp_path / "report" / "open_loop.png").exists()
 
 
+def test_a_robot_needs_no_rollouts(
+    tmp_path: Path,
+    world_model_path: Path,
+    episodes_root: Path,
+    replay_path: Path,
+    lerobot_wm_command: Callable[..., None],
+    capsys: pytest.CaptureFixture,
+) -> None:
+    run = write_log(tmp_path / "world_model")
+    lerobot_wm_command(
+        f"report --train_logs={run} --replay={replay_path} --world_model_path={world_model_path}",
+        f"--dataset.repo_id=test/episodes --dataset.root={episodes_root} --output_dir={tmp_path}/report",
+    )
+    assert REPEAT in capsys.readouterr().out
+    page = Page(tmp_path / "report" / "index.html")
+    assert page.anchors == ["data", "replay", "imagination", "knowledge", "training", "provenance"]
+    assert page.headings[0] == "The data"
+    error = json.loads(replay_path.read_text())["error_in_std"][REPEAT]["trained"]
+    assert f"{error:.3f}" in page.text
+    figure = (replay_path.parent / "episode_1.png").read_bytes()
+    assert ("img", data_uri(figure, PNG)) in page.sources
+    assert "Episode 1" in page.text
+    assert "eval_info.json" not in page.text
+    assert not (tmp_path / "report" / "success.md").exists()
+
+
+def test_a_page_without_content_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"--records.*--replay"):
+        report(ReportConfig(output_dir=tmp_path / "report", videos=str(write_evaluation(tmp_path / "eval"))))
+    assert not (tmp_path / "report").exists()
+
+
+def write_log(run: Path) -> Path:
+    """An output folder of `lerobot-wm train` with a log of three steps."""
+    run.mkdir()
+    entries = [
+        {"step": step, "steps": step, "loss": 1 / step, "kl": 3.0, "update_s": 0.1} for step in (1, 2, 3)
+    ]
+    (run / "train_log.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    return run
+
+
 def write_evaluation(folder: Path, *names: str) -> Path:
     """An output folder of `lerobot-wm eval` for arm wm_bc, with videos on reach-v3."""
     (folder / "videos" / "reach-v3").mkdir(parents=True)
@@ -88,13 +131,7 @@ def write_evaluation(folder: Path, *names: str) -> Path:
 
 def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, episodes_root: Path) -> None:
     evaluation = write_evaluation(tmp_path / "eval", "variation_04_failure")
-    run = tmp_path / "world_model"
-    run.mkdir()
-    entries = [
-        {"step": step, "steps": step, "loss": 1 / step, "kl": 3.0, "update_s": 0.1} for step in (1, 2, 3)
-    ]
-    (run / "train_log.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
-
+    run = write_log(tmp_path / "world_model")
     index = report(
         ReportConfig(
             records=str(records_file),
@@ -246,6 +283,8 @@ def test_inputs_that_are_not_there_are_named(records_file: Path, tmp_path: Path)
         build(videos=str(tmp_path))
     with pytest.raises(FileNotFoundError, match=r"train_log\.jsonl.*--train_logs"):
         build(train_logs=str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"replay\.json.*--replay"):
+        build(replay=tmp_path / "replay.json")
     with pytest.raises(ValueError, match=r"--world_model_path=.*--dataset\.repo_id"):
         build(world_model_path=str(tmp_path))
     assert not (tmp_path / "report").exists()

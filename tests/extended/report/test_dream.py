@@ -38,7 +38,7 @@ from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
-from lerobot_wm.report.world_model import dream_clips
+from lerobot_wm.report.models import dream_clips
 from lerobot_wm.world_model.config import RSSMConfig
 from tests.extended.report.quality_model import lively_world_model
 

@@ -1,4 +1,4 @@
-"""What the page shows of a world model: dreams of some episodes, and what `lerobot-wm quality` measured."""
+"""What the page shows of models: dreams of some episodes, and what `lerobot-wm quality` and `replay` measured."""
 
 import json
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from lerobot_wm.inspect.quality_figures import (
     probe_error,
     quality_figures,
 )
+from lerobot_wm.inspect.replay import replay_table
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.tables import Measurement, ReportTable
 
@@ -94,6 +95,43 @@ def _clip(dreams: Dreams, task: str, episode: int, fps: int) -> DreamClip:
     )
 
 
+# Episodes whose predicted and recorded actions are drawn.
+MAX_REPLAYS = 4
+
+
+@dataclass(frozen=True)
+class ReplaySummary:
+    """What `lerobot-wm replay` found: its table, and for some episodes, by index, a picture as a data URI."""
+
+    table: ReportTable
+    pictures: dict[int, str]
+    n_episodes: int
+
+
+def read_replay(path: Path) -> ReplaySummary:
+    """Read a replay.json and the figures of the first episodes beside it.
+
+    Raises:
+        FileNotFoundError: One of them is missing.
+    """
+    content = json.loads(_read(path, "--replay", "replay"))
+    episodes = list(dict.fromkeys(row["episode"] for row in content["episodes"]))
+    pictures = {
+        episode: data_uri(_read(path.with_name(f"episode_{episode}.png"), "--replay", "replay"), PNG)
+        for episode in episodes[:MAX_REPLAYS]
+    }
+    return ReplaySummary(replay_table(content), pictures, len(episodes))
+
+
+def _read(path: Path, flag: str, command: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"{path} is missing: {flag} takes the {command}.json that `lerobot-wm {command}` wrote, in its folder."
+        ) from error
+
+
 def read_quality(path: Path) -> dict[str, Any]:
     """What the page's section on quality shows: the content of quality.json, its figures and tables.
 
@@ -103,17 +141,11 @@ def read_quality(path: Path) -> dict[str, Any]:
     Raises:
         FileNotFoundError: One of the two is missing.
     """
-    examples = path.with_name(EXAMPLES_NAME)
-    for needed in (path, examples):
-        if not needed.is_file():
-            raise FileNotFoundError(
-                f"{needed} is missing: --quality takes the quality.json that `lerobot-wm quality` wrote, in its folder."
-            )
-    result = json.loads(path.read_text())
+    result = json.loads(_read(path, "--quality", "quality"))
     open_loop, probes = pd.DataFrame(result["open_loop"]), pd.DataFrame(result["probes"])
     return result | {
         "figures": {name: figure_uri(figure, SVG) for name, figure in quality_figures(result).items()},
-        "examples": data_uri(examples.read_bytes(), PNG),
+        "examples": data_uri(_read(path.with_name(EXAMPLES_NAME), "--quality", "quality"), PNG),
         "example_horizon": EXAMPLE_HORIZON,
         "kl_overall": result["kl"]["tasks"][-1],
         "open_loop_table": _open_loop_table(open_loop),
