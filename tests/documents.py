@@ -14,7 +14,12 @@ def blocks(document: str, language: str) -> list[str]:
 
 def commands(document: str) -> list[list[str]]:
     """The words of each command in the bash blocks of a document, with the user's name put in."""
-    text = "".join(blocks(document, "bash")).replace("\\\n", " ").replace("$USER", "test")
+    return commands_of("".join(blocks(document, "bash")))
+
+
+def commands_of(text: str) -> list[list[str]]:
+    """The words of each command in a bash block, with the user's name put in."""
+    text = text.replace("\\\n", " ").replace("$USER", "test")
     lines = [shlex.split(line, comments=True) for line in text.splitlines()]
     return [words for words in lines if words]
 

@@ -3,11 +3,17 @@
 LeRobot finds the class of a robot by the names: `Arm` and `ArmConfig` in a module `arm`.
 """
 
+import json
+import signal
+import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import patch
 
 import numpy as np
 from lerobot.robots import Robot, RobotConfig
+from lerobot.scripts import lerobot_rollout
 
 JOINTS = ("shoulder.pos", "elbow.pos", "gripper.pos")
 
@@ -81,3 +87,33 @@ class Arm(Robot):
             length = int(width * (0.5 + 0.4 * np.tanh(angle)))
             picture[8 * i + 4 : 8 * i + 10, :length, i % 3] = 220
         return picture
+
+
+def run_rollout(words: list[str], folder: Path, image_sizes: dict[str, list[int]]) -> Arm:
+    """Run a command of `lerobot-rollout` on a simulated arm in place of its robot; returns the arm.
+
+    Args:
+        words: The command.
+        folder: Where the arm's calibration is looked for.
+        image_sizes: Height and width of the arm's cameras.
+    """
+    words = [
+        word for word in words if not word.startswith("--robot.") or word.startswith("--robot.n_joints=")
+    ]
+    words += [
+        "--robot.type=simulated_arm",
+        f"--robot.image_sizes={json.dumps(image_sizes)}",
+        "--play_sounds=false",
+    ]
+    words += [f"--robot.calibration_dir={folder}", "--return_to_initial_position=false"]
+    # LeRobot's handlers outlive its command.
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    Arm.made.clear()
+    try:
+        with patch.object(sys, "argv", words):
+            lerobot_rollout.main()
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    return Arm.made[0]

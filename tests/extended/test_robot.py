@@ -1,20 +1,17 @@
 """docs/robot.md: a policy's checkpoint in LeRobot's own `lerobot-rollout`, on a simulated arm."""
 
 import json
-import signal
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.scripts import lerobot_rollout
 from torch import Tensor
 
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from tests.documents import commands, with_flags
-from tests.extended.arm import JOINTS, Arm
+from tests.extended.arm import JOINTS, Arm, run_rollout
 from tests.flags import SMALL_WORLD_MODEL
 from tests.recording import camera, record, train_flags, vector
 
@@ -51,26 +48,13 @@ def policies(
 
 
 @pytest.fixture
-def rollout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Arm]]:
+def rollout(tmp_path: Path) -> Callable[..., Arm]:
     """`lerobot-rollout`, given a command of the document, on a simulated arm, which is returned."""
-    handlers = {number: signal.getsignal(number) for number in lerobot_signals()}
 
     def run(words: list[str], *flags: str, image_sizes: dict[str, list[int]] = CAMERAS) -> Arm:
-        elsewhere = [word for word in words if not word.startswith("--robot.")]
-        robot = ["--robot.type=simulated_arm", f"--robot.image_sizes={json.dumps(image_sizes)}"]
-        place = [f"--robot.calibration_dir={tmp_path}", "--return_to_initial_position=false"]
-        monkeypatch.setattr(sys, "argv", [*elsewhere, *robot, *place, "--play_sounds=false", *flags])
-        Arm.made.clear()
-        lerobot_rollout.main()
-        return Arm.made[0]
+        return run_rollout([*words, *flags], tmp_path, image_sizes)
 
-    yield run
-    for number, handler in handlers.items():  # LeRobot's handlers outlive its command
-        signal.signal(number, handler)
-
-
-def lerobot_signals() -> tuple[signal.Signals, ...]:
-    return (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    return run
 
 
 def base(policy: Path, **flags: object) -> list[str]:
