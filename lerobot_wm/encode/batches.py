@@ -13,22 +13,16 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 from tqdm import tqdm
 
-from lerobot_wm.constants import ACTION, OBS_LATENT
-from lerobot_wm.data.cache import camera_frames
-from lerobot_wm.data.tables import column_tensor
+from lerobot_wm.constants import OBS_LATENT
+from lerobot_wm.encode.episodes import embed_episodes, read_episodes
 from lerobot_wm.files import appears_whole
-from lerobot_wm.nn.images import stack_images
-from lerobot_wm.policies.common.features import join_vectors
 from lerobot_wm.policies.common.names import OWN_NAMES, names_before
 from lerobot_wm.policies.latent.policy import EncoderPolicy, encoder_config
 from lerobot_wm.workers import check_same_settings
 
 _EPISODES_PER_BATCH = 16
-# Images per call of the encoder, which bounds memory for long episodes.
-_FRAMES_PER_CHUNK = 512
 
 
 def episode_batches(dataset: LeRobotDataset) -> list[range]:
@@ -58,59 +52,26 @@ def filter_batches(
     Yields:
         The latents s_t of each batch, (N, L) float32 on the CPU.
     """
-    policy.eval()
-    world_model, image_size = policy.world_model, policy.config.image_size
-    device = next(world_model.parameters()).device
-    episodes = [episode for batch in batches for episode in batch]
-    dataset = LeRobotDataset(source.repo_id, source.root, episodes, revision=source.revision)
-    # (N, H, W, C) uint8 of each camera, by absolute frame index; the same files as in training.
-    camera_keys = names_before(policy.config.cameras, rename_map)
-    cameras = [camera_frames(dataset, key, image_size) for key in camera_keys]
-    all_lengths = source.meta.episodes["length"][:]
-    lengths = [all_lengths[episode] for episode in episodes]
-
-    def by_episode(values: Tensor) -> dict[int, Tensor]:
-        return dict(zip(episodes, values.split(lengths), strict=True))
-
-    index = by_episode(_column(dataset, "index").flatten())
-    actions = by_episode(_column(dataset, ACTION))
-    vectors = names_before(encoder_config(policy).proprio_vectors, rename_map)
-    joined = join_vectors({key: _column(dataset, key) for key in vectors}, vectors)
-    proprio = None if joined is None else by_episode(joined)
+    world_model = policy.eval().world_model
+    chosen = [episode for batch in batches for episode in batch]
+    episodes = read_episodes(
+        LeRobotDataset(source.repo_id, source.root, chosen, revision=source.revision),
+        names_before(policy.config.cameras, rename_map),
+        policy.config.image_size,
+        proprio=names_before(encoder_config(policy).proprio_vectors, rename_map),
+    )
+    start = 0
     for batch in batches:
-        embeds = []
-        for episode in batch:
-            chunks = [
-                world_model.embed(
-                    stack_images(
-                        [_images(frames[index[episode][rows]].to(device)) for frames in cameras], image_size
-                    )[None],
-                    None if proprio is None else proprio[episode][rows][None].to(device),
-                )[0]
-                for rows in torch.arange(len(index[episode])).split(_FRAMES_PER_CHUNK)
-            ]
-            embeds.append(torch.cat(chunks))  # (T, E)
-        # The filter is causal: padding after the last frame of shorter episodes does not change their latents.
-        padded_embeds = pad_sequence(embeds, batch_first=True)  # (B, T, E)
-        padded_actions = pad_sequence([actions[episode] for episode in batch], batch_first=True).to(device)
+        of_batch = episodes[start : start + len(batch)]
+        start += len(batch)
+        embeds, actions = embed_episodes(world_model, of_batch)
         if sample_seed is not None:
             # A seed for each batch: its samples do not depend on which job encodes it, or after what.
             [seed] = np.random.SeedSequence([sample_seed, batch.start]).generate_state(1)
             torch.manual_seed(int(seed))
-        states = world_model.filter_embeds(padded_embeds, padded_actions, sample=sample_seed is not None)
+        states = world_model.filter_embeds(embeds, actions, sample=sample_seed is not None)
         latents = states.latent.cpu()  # (B, T, L)
-        yield torch.cat([latents[i, : len(embed)] for i, embed in enumerate(embeds)])
-
-
-def _column(dataset: LeRobotDataset, key: str) -> Tensor:
-    """(N, *shape)."""
-    shape = tuple(dataset.meta.features[key]["shape"])
-    return column_tensor(dataset.hf_dataset, key, shape).view(-1, *shape)
-
-
-def _images(frames: Tensor) -> Tensor:
-    """(T, H, W, C) uint8 -> (T, C, H, W) in [0, 1]."""
-    return frames.movedim(-1, -3).float() / 255
+        yield torch.cat([latents[i, : len(episode)] for i, episode in enumerate(of_batch)])
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from lerobot_wm.constants import ACTION, OBS_ENV_STATE, TASK
+from lerobot_wm.constants import OBS_ENV_STATE, TASK
 from lerobot_wm.data.tables import last_action_predicts_next, relative_to_state
-from lerobot_wm.inspect.episodes import ImaginingPolicy, filter_frames, reward_key, rssm_of, stack_episodes
+from lerobot_wm.encode.episodes import Episode
+from lerobot_wm.inspect.episodes import ImaginingPolicy, filter_episodes, imagine, reward_key, rssm_of
 from lerobot_wm.inspect.open_loop import psnr
-from lerobot_wm.nn.images import camera_images
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.world_model.rssm import RSSMState
 
@@ -99,9 +99,7 @@ def actions_are_targets(meta: LeRobotDatasetMetadata) -> bool:
 
 
 @torch.no_grad()
-def dream(
-    policy: ImaginingPolicy, episode: dict[str, Any], context: int, *, hold_action: bool = False
-) -> Dreams:
+def dream(policy: ImaginingPolicy, episode: Episode, context: int, *, hold_action: bool = False) -> Dreams:
     """Filter the first frames of an episode and imagine the others, always taking the mean of z_t.
 
     The kinds of action are those of the episode, zero in the environment's units (no command), and, for a policy, the
@@ -111,7 +109,7 @@ def dream(
 
     Args:
         policy: Holds the world model.
-        episode: Its first T frames, as `read_episodes` yields them.
+        episode: Its first T frames, see `load_episodes`.
         context: How many of them the model sees.
         hold_action: See `actions_are_targets`.
 
@@ -119,42 +117,46 @@ def dream(
         ValueError: The policy does not know the task.
     """
     world_model, key = rssm_of(policy), reward_key(policy)
-    batch = stack_episodes(policy, [episode])
-    seen = filter_frames(policy, batch, context)
-    # The action executed at the last frame seen leads to the first imagined one.
-    true_actions = batch[ACTION][:, context - 1 : -1]  # (1, T - context, A)
+    # The filter is causal: its first states do not know the later frames.
+    filtered = filter_episodes(world_model, [episode])
+    device, last_seen = world_model.action_scaling.offset.device, context - 1
+    seen = filtered[0].latents[:context].to(device)  # (context, L)
+    true_actions = episode.actions[last_seen:-1]  # (T - context, A)
     if hold_action:
         # Of the frame before the last one seen.
-        held = batch[ACTION][:, max(context - 2, 0)]  # (1, A)
-        idle, still = HELD_ACTION, held[:, None].expand_as(true_actions)
+        idle, still = HELD_ACTION, episode.actions[max(last_seen - 1, 0)].expand_as(true_actions)
     else:
         idle, still = ZERO_ACTIONS, torch.zeros_like(true_actions)
     latents = {
-        TRUE_ACTIONS: world_model.imagine(seen.last(), true_actions).latent,
-        idle: world_model.imagine(seen.last(), still).latent,
+        name: imagine(world_model, filtered, last_seen, actions[None])[0]
+        for name, actions in ((TRUE_ACTIONS, true_actions), (idle, still))
     }
     if isinstance(policy, LatentPolicy):
-        last = {key: value[:, context - 1] for key, value in batch.items()} | {TASK: [episode[TASK]]}
-        latents[OWN_ACTIONS] = _act(policy, seen.last(), last, true_actions.shape[1])
+        last: dict[str, Any] = {
+            key: value[last_seen][None].to(device) for key, value in episode.columns.items()
+        }
+        states = filtered[0].states
+        state = RSSMState(states.deter[last_seen][None].to(device), states.stoch[last_seen][None].to(device))
+        latents[OWN_ACTIONS] = _act(policy, state, last | {TASK: [episode.task]}, len(true_actions))
 
     def decode(imagined: Tensor) -> Dream:
-        whole = torch.cat([seen.latent, imagined], dim=1)  # (1, T, L)
-        reward = world_model.predict_reward(whole)[0].cpu() if world_model.config.predict_reward else None
-        return Dream(world_model.decode(whole)[0].cpu(), reward)
+        whole = torch.cat([seen, imagined])  # (T, L)
+        reward = world_model.predict_reward(whole).cpu() if world_model.config.predict_reward else None
+        return Dream(world_model.decode(whole).cpu(), reward)
 
     return Dreams(
         context=context,
         n_cameras=len(policy.config.cameras),
-        truth=camera_images(batch, policy.config.cameras, policy.config.image_size)[0].cpu(),
+        truth=episode.images(),
         # next.success is stored as bool.
-        reward=episode[key].float() if key in episode else None,
+        reward=episode.columns[key].float().flatten() if key in episode.columns else None,
         reward_key=key,
         by_actions={name: decode(imagined) for name, imagined in latents.items()},
     )
 
 
 def _act(policy: LatentPolicy, state: RSSMState, last: dict[str, Any], n_steps: int) -> Tensor:
-    """Latents (1, n_steps, L) that the policy's actions lead to from s_t (1, ·), given the rest of frame t."""
+    """Latents (n_steps, L) that the policy's actions lead to from s_t (1, ·), given the rest of frame t."""
     world_model = rssm_of(policy)
     tasks = policy.one_hot_tasks(last, 1)  # (1, N)
     env_state = last[OBS_ENV_STATE] if policy.config.use_environment_state else None
@@ -168,7 +170,7 @@ def _act(policy: LatentPolicy, state: RSSMState, last: dict[str, Any], n_steps: 
         proprio[:, reached] = action[:, targets]
         state = world_model.imagine(state, action[:, None]).last()
         latents.append(state.latent)
-    return torch.stack(latents, dim=1)
+    return torch.cat(latents)
 
 
 def strip_figure(dreams: Dreams) -> Figure:

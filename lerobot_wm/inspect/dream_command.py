@@ -11,7 +11,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.evaluate.wandb_log import wandb_run
 from lerobot_wm.inspect.dream import Dreams, actions_are_targets, dream, strip_figure, write_dream
-from lerobot_wm.inspect.episodes import CheckpointConfig, check_features, load_world_model, read_episodes
+from lerobot_wm.inspect.episodes import CheckpointConfig, check_features, load_episodes, load_world_model
 from lerobot_wm.inspect.open_loop import CONTEXT
 from lerobot_wm.inspect.pictures import PNG, figure_bytes
 from lerobot_wm.policies.common.checkpoint import split_revision
@@ -65,7 +65,7 @@ def dream_of(cfg: DreamConfig) -> Dreams:
     with quiet():
         meta = cfg.dataset.metadata([cfg.episode])
         check_features(policy, meta)
-        [episode] = read_episodes(policy, meta, cfg.dataset, [cfg.episode], _count_frames(cfg, meta))
+        [episode] = load_episodes(policy, cfg.dataset, [cfg.episode], _count_frames(cfg, meta))
     dreams = dream(policy, episode, cfg.context, hold_action=actions_are_targets(meta))
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     write_dream(cfg.video, dreams, meta.fps)

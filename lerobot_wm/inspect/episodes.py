@@ -1,28 +1,24 @@
-"""World models that imagine images, and the episodes of image datasets that they are shown."""
+"""World models that imagine images, and what they make of recorded episodes."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
+from tqdm import tqdm
 
-from lerobot_wm.constants import ACTION, TASK
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.nn.images import camera_images, resize_images
+from lerobot_wm.encode.episodes import Episode, embed_episodes, read_episodes
 from lerobot_wm.policies.common.checks import check_reads
 from lerobot_wm.policies.common.config import check_cameras_present
-from lerobot_wm.policies.common.features import join_vectors
 from lerobot_wm.policies.latent.policy import LatentPolicy, encoder_config, load_encoder
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.model import WorldModel
 from lerobot_wm.world_model.rssm import RSSMState
 
-# Frames that are read before they are resized: bounds memory for long episodes of large images.
-_FRAMES_AT_ONCE = 64
+_EPISODES_PER_BATCH = 16
 
 type ImaginingPolicy = WMRSSMPolicy | LatentPolicy
 
@@ -67,11 +63,6 @@ def reward_key(policy: ImaginingPolicy) -> str:
     return world_model_config(policy).reward_key
 
 
-def keys_read(policy: ImaginingPolicy) -> list[str]:
-    """What the world model and the policy read from a dataset."""
-    return [*policy.config.features_read, ACTION]
-
-
 def check_features(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata) -> None:
     """Check that an image dataset has what the policy reads, in the size it was trained on; images may have any size.
 
@@ -93,71 +84,81 @@ def episodes_by_task(meta: LeRobotDatasetMetadata, min_length: int = 1) -> dict[
     return found
 
 
-def read_episodes(
-    policy: ImaginingPolicy,
-    meta: LeRobotDatasetMetadata,
-    source: SourceConfig,
-    episodes: list[int],
-    max_frames: int | None = None,
-) -> Iterator[dict[str, Any]]:
-    """Read episodes one after another; no other episode's images are decoded.
+def load_episodes(
+    policy: ImaginingPolicy, source: SourceConfig, episodes: list[int], max_frames: int | None = None
+) -> list[Episode]:
+    """Read episodes of an image dataset with all of their numbers, as the policy's world model is shown them.
 
     Args:
         policy: The world model, or a policy on it.
-        meta: The dataset's metadata.
         source: Where the dataset is.
         episodes: Indices in ascending order.
-        max_frames: How many frames of each to read, from the first on; None reads all.
-
-    Yields:
-        What the policy reads of T frames: each camera (T, C, H, W) in [0, 1] at the model's image size, `action` (T, A)
-        and the other keys of `keys_read` (T, ·); the reward that the world model learned (T,) where the dataset has
-        it; `task`, under which `episodes_by_task` counts the episode.
+        max_frames: How many frames of each to keep, from the first on; None keeps all.
     """
-    keys = [*keys_read(policy), *({reward_key(policy)} & meta.features.keys())]
-    all_lengths, tasks = meta.episodes["length"][:], meta.episodes["tasks"][:]
-    lengths = [all_lengths[episode] for episode in episodes]
-    times = [step / meta.fps for step in range(min(max(lengths), _FRAMES_AT_ONCE))]
-    dataset = LeRobotDataset(
-        source.repo_id,
-        root=source.root,
-        revision=source.revision,
-        episodes=episodes,
-        delta_timestamps=dict.fromkeys(keys, times),
+    dataset = LeRobotDataset(source.repo_id, source.root, episodes, revision=source.revision)
+    return read_episodes(
+        dataset,
+        policy.config.cameras,
+        policy.config.image_size,
+        proprio=world_model_config(policy).proprio_vectors,
+        columns=[
+            key
+            for key, feature in dataset.meta.features.items()
+            if key not in dataset.meta.camera_keys and feature["dtype"].startswith(("float", "int", "bool"))
+        ],
+        max_frames=max_frames,
     )
-    # The episode's first frame among those of `episodes`.
-    start = 0
-    for episode, length in zip(episodes, lengths, strict=True):
-        n_frames = min(length, max_frames or length)
-        chunks: dict[str, list[Tensor]] = {key: [] for key in keys}
-        for position in range(0, n_frames, len(times)):
-            # LeRobot repeats an episode's last frame beyond its end.
-            window = dataset[start + position]
-            for key in keys:
-                chunk = window[key][: n_frames - position]
-                if key in policy.config.cameras:
-                    chunk = resize_images(chunk, policy.config.image_size)
-                elif tuple(meta.features[key]["shape"]) == (1,) and key != reward_key(policy):
-                    chunk = chunk[:, None]
-                chunks[key].append(chunk)
-        yield {key: torch.cat(of_key) for key, of_key in chunks.items()} | {TASK: tasks[episode][0]}
-        start += length
 
 
-def stack_episodes(policy: ImaginingPolicy, episodes: list[dict[str, Any]]) -> dict[str, Tensor]:
-    """Stack what the policy reads of B episodes of T frames on its device: (B, T, ·) by key."""
-    return {
-        key: torch.stack([episode[key] for episode in episodes]).to(policy.config.device)
-        for key in keys_read(policy)
-    }
+@dataclass(frozen=True)
+class Filtered:
+    """The closed loop over one episode of T frames: the filter sees every image; z_t is the posterior mean.
+
+    Attributes:
+        states: (T, ·).
+        embeds: (T, E).
+        kl: KL(posterior || prior) in nats, (T,).
+    """
+
+    states: RSSMState
+    embeds: Tensor
+    kl: Tensor
+
+    @property
+    def latents(self) -> Tensor:
+        """s_t, (T, D+S)."""
+        return self.states.latent
 
 
-def filter_frames(
-    policy: ImaginingPolicy, batch: dict[str, Tensor], n_frames: int | None = None
-) -> RSSMState:
-    """Filter the first `n_frames` of stacked episodes, taking z_t at its posterior mean."""
-    frames = {key: value[:, :n_frames] for key, value in batch.items()}
-    world_model = rssm_of(policy)
-    images = camera_images(frames, policy.config.cameras, policy.config.image_size)
-    proprio = join_vectors(frames, world_model_config(policy).proprio_vectors)
-    return world_model.filter(images, frames[ACTION], proprio)
+@torch.no_grad()
+def filter_episodes(world_model: WorldModel, episodes: list[Episode]) -> list[Filtered]:
+    """Filter every episode from its first frame on; results are on the CPU."""
+    results = []
+    starts = range(0, len(episodes), _EPISODES_PER_BATCH)
+    for start in tqdm(starts, desc="Filtering", unit="batch", disable=len(starts) < 2):
+        batch = episodes[start : start + _EPISODES_PER_BATCH]
+        embeds, actions = embed_episodes(world_model, batch)
+        states, kl = world_model.filter_with_kl(embeds, actions)  # (B, T, ·), (B, T)
+        for i, episode in enumerate(batch):
+            steps = len(episode)
+            of_episode = RSSMState(states.deter[i, :steps].cpu(), states.stoch[i, :steps].cpu())
+            results.append(Filtered(of_episode, embeds[i, :steps].cpu(), kl[i, :steps].cpu()))
+    return results
+
+
+def imagine(world_model: WorldModel, filtered: list[Filtered], step: int, actions: Tensor) -> Tensor:
+    """Imagine what follows frame t of E episodes, z at the prior's mean.
+
+    Args:
+        world_model: The model that filtered.
+        filtered: Their closed loops.
+        step: t, the last frame seen.
+        actions: a_t ... a_{t+H-1}, (E, H, A); the action executed at the last frame seen leads to the first imagined.
+
+    Returns:
+        s_{t+1} ... s_{t+H}, (E, H, D+S) on the model's device.
+    """
+    device = world_model.action_scaling.offset.device
+    deter = torch.stack([loop.states.deter[step] for loop in filtered])
+    stoch = torch.stack([loop.states.stoch[step] for loop in filtered])
+    return world_model.imagine(RSSMState(deter.to(device), stoch.to(device)), actions.to(device)).latent

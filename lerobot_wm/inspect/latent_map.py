@@ -3,23 +3,20 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
-from tqdm import tqdm
 
-from lerobot_wm.constants import TASK
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import (
     ImaginingPolicy,
     episodes_by_task,
-    filter_frames,
-    read_episodes,
-    stack_episodes,
+    filter_episodes,
+    load_episodes,
+    rssm_of,
 )
 
 # Of all tasks together, but at least one of each.
@@ -60,7 +57,6 @@ class LatentMap:
         return list(zip(self.tasks, task_colours(len(self.tasks)), strict=True))
 
 
-@torch.no_grad()
 def latent_map(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig) -> LatentMap:
     """Filter the last episodes of each task and project their latents, z_t at its posterior mean.
 
@@ -74,14 +70,13 @@ def latent_map(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata, source: So
     episodes = sorted(index for of_task in by_task.values() for index in of_task[-per_task:])
     tasks = list(by_task)
     latents, task, time = [], [], []
-    read = read_episodes(policy, meta, source, episodes, MAX_FRAMES)
-    for episode in tqdm(read, total=len(episodes), desc="Mapping", unit="episode"):
-        states = filter_frames(policy, stack_episodes(policy, [episode]))
-        of_episode = states.latent[0].cpu().numpy()  # (T, L)
+    read = load_episodes(policy, source, episodes, MAX_FRAMES)
+    for episode, loop in zip(read, filter_episodes(rssm_of(policy), read), strict=True):
+        of_episode = loop.latents.numpy()  # (T, L)
         last = len(of_episode) - 1
         frames = np.unique(np.linspace(0, last, min(last + 1, FRAMES_PER_EPISODE)).round().astype(int))
         latents.append(of_episode[frames])
-        task.append(np.full(len(frames), tasks.index(episode[TASK])))
+        task.append(np.full(len(frames), tasks.index(episode.task)))
         time.append(frames / max(last, 1))
     stacked = np.concatenate(latents)  # (N, L)
     pca = PCA(2, random_state=0)

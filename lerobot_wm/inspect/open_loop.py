@@ -4,7 +4,6 @@ import logging
 import math
 from dataclasses import dataclass
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,17 +12,17 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wm.constants import ACTION, TASK
 from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.encode.episodes import Episode
 from lerobot_wm.inspect.episodes import (
     ImaginingPolicy,
     episodes_by_task,
-    filter_frames,
-    read_episodes,
+    filter_episodes,
+    imagine,
+    load_episodes,
     rssm_of,
-    stack_episodes,
 )
-from lerobot_wm.nn.images import camera_images, side_by_side
+from lerobot_wm.nn.images import side_by_side
 from lerobot_wm.tables import Measurement, ReportTable
 
 logger = logging.getLogger(__name__)
@@ -72,35 +71,31 @@ def open_loop(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata, source: Sou
         )
         return []
     chosen = sorted(index for episodes in by_task.values() for index in episodes[-EPISODES_PER_TASK:])
-    windows: dict[str, list[dict[str, Any]]] = {task: [] for task in by_task}
-    read = read_episodes(policy, meta, source, chosen, WINDOW)
-    for window in tqdm(read, total=len(chosen), desc="Imagining", unit="episode"):
-        windows[window[TASK]].append(window)
-    return [predict(policy, task, of_task) for task, of_task in windows.items()]
+    windows: dict[str, list[Episode]] = {task: [] for task in by_task}
+    for window in load_episodes(policy, source, chosen, WINDOW):
+        windows[window.task].append(window)
+    return [predict(policy, of_task) for of_task in tqdm(windows.values(), desc="Imagining", unit="task")]
 
 
 @torch.no_grad()
-def predict(policy: ImaginingPolicy, task: str, windows: list[dict[str, Any]]) -> OpenLoop:
+def predict(policy: ImaginingPolicy, windows: list[Episode]) -> OpenLoop:
     """Filter the first CONTEXT frames of each window, then imagine the rest under its actions.
 
     Args:
         policy: Holds the world model.
-        task: The task of the windows.
-        windows: The first WINDOW frames of episodes, as `read_episodes` yields them.
+        windows: The first WINDOW frames of episodes of one task.
     """
     world_model, n_cameras = rssm_of(policy), len(policy.config.cameras)
-    batch = stack_episodes(policy, windows)
-    images = camera_images(batch, policy.config.cameras, policy.config.image_size)  # (B, T, C, 64, 64)
-    context = filter_frames(policy, batch, CONTEXT)
-    # The action executed at the last frame seen leads to the first imagined one.
-    states = world_model.imagine(context.last(), batch[ACTION][:, CONTEXT - 1 : -1])
-    imagined = world_model.decode(states.latent)  # (B, T - CONTEXT, C, 64, 64)
+    images = torch.stack([window.images() for window in windows])  # (B, T, C, 64, 64)
+    actions = torch.stack([window.actions[CONTEXT - 1 : -1] for window in windows])  # (B, T - CONTEXT, A)
+    latents = imagine(world_model, filter_episodes(world_model, windows), CONTEXT - 1, actions)
+    imagined = world_model.decode(latents).cpu()  # (B, T - CONTEXT, C, 64, 64)
     future, last_seen = images[:, CONTEXT:], images[:, CONTEXT - 1 : CONTEXT]
     return OpenLoop(
-        task=task,
+        task=windows[0].task,
         n_episodes=len(windows),
-        truth=side_by_side(images[0], n_cameras).cpu().numpy(),
-        imagined=side_by_side(imagined[0], n_cameras).cpu().numpy(),
+        truth=side_by_side(images[0], n_cameras).numpy(),
+        imagined=side_by_side(imagined[0], n_cameras).numpy(),
         psnr=_psnr_by_horizon(imagined, future),
         copy_psnr=_psnr_by_horizon(last_seen, future),
     )

@@ -2,31 +2,30 @@
 
 import json
 import logging
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 
 import draccus
+import pandas as pd
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.constants import QUALITY_NAME
+from lerobot_wm.constants import QUALITY_NAME, VARIATION
 from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.data.tables import column_tensor
+from lerobot_wm.encode.episodes import Episode
 from lerobot_wm.inspect.episodes import (
     ImaginingPolicy,
     episodes_by_task,
+    filter_episodes,
+    load_episodes,
     load_world_model,
     rssm_of,
     world_model_config,
 )
 from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, WINDOW
 from lerobot_wm.inspect.pictures import PNG, SVG, figure_bytes
-from lerobot_wm.inspect.quality_episodes import (
-    POSITIONS,
-    Episode,
-    filter_episodes,
-    read_demonstrations,
-    start_positions,
-)
 from lerobot_wm.inspect.quality_figures import EXAMPLES_NAME, examples_figure, quality_figures
 from lerobot_wm.inspect.quality_measures import (
     FOREGROUND_THRESHOLD,
@@ -38,7 +37,15 @@ from lerobot_wm.inspect.quality_measures import (
     reward_quality,
     summarise,
 )
-from lerobot_wm.inspect.quality_probes import FRAMES_PER_EPISODE, draw_frames, probe_positions, probe_task
+from lerobot_wm.inspect.quality_probes import (
+    FRAMES_PER_EPISODE,
+    POSITIONS,
+    draw_frames,
+    probe_positions,
+    probe_targets,
+    probe_task,
+    start_positions,
+)
 from lerobot_wm.nn.images import side_by_side
 from lerobot_wm.policies.common.checks import check_reads
 from lerobot_wm.records import provenance
@@ -85,15 +92,14 @@ def quality(cfg: QualityConfig) -> Path:
     policy = load_world_model(cfg.world_model_path)
     world_model, cameras = rssm_of(policy), policy.config.cameras
     training, episodes = _read_datasets(cfg, policy)
-    n_seen = _count_seen(training, episodes) if set(episodes[0].targets) == set(POSITIONS) else None
-    knows_success = all(episode.success is not None for episode in episodes)
-    window_length = world_model_config(policy).window_length
+    knows_positions = set(probe_targets(episodes[0])) == set(POSITIONS)
+    config = world_model_config(policy)
 
     logger.info("Filtering %d episodes", len(training) + len(episodes))
     all_filtered = filter_episodes(world_model, training + episodes)
     filtered = all_filtered[len(training) :]
     # Open loop looks WINDOW frames ahead; the rest takes episodes of any length.
-    long = [i for i, episode in enumerate(episodes) if len(episode.actions) >= WINDOW]
+    long = [i for i, episode in enumerate(episodes) if len(episode) >= WINDOW]
     tasks = [episodes[i].task for i in long]
     mean_image, median_image = mean_and_median_image(episodes)
     stacked = predictions(
@@ -111,24 +117,26 @@ def quality(cfg: QualityConfig) -> Path:
         "dataset": cfg.dataset.repo_id,
         "train_dataset": cfg.train_dataset and cfg.train_dataset.repo_id,
         "n_episodes": len(episodes),
-        "n_episodes_of_seen_positions": n_seen if training else None,
+        "n_episodes_of_seen_positions": _count_seen(training, episodes)
+        if training and knows_positions
+        else None,
         "settings": {
             "seed": cfg.seed,
             "context": CONTEXT,
             "horizons": HORIZONS,
             "foreground_threshold": FOREGROUND_THRESHOLD,
-            "restart": window_length,
+            "restart": config.window_length,
             "probe_frames_per_episode": FRAMES_PER_EPISODE,
             "rssm": asdict(world_model.config),
         },
         "open_loop": summarise(image_errors(images, tasks, median_image)),
-        "reward": reward_quality(world_model, episodes, filtered)
-        if world_model.config.predict_reward and knows_success
+        "reward": reward_quality(world_model, episodes, filtered, config.reward_key)
+        if world_model.config.predict_reward
         else None,
         "probes": probe_positions(frames),
         "task_probe": probe_task(frames),
         "kl": kl_quality(episodes, filtered, world_model.config.free_nats),
-        "drift": drift(world_model, episodes, filtered, window_length),
+        "drift": drift(world_model, episodes, filtered, config.window_length),
         "provenance": provenance(),
     }
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
@@ -142,27 +150,49 @@ def quality(cfg: QualityConfig) -> Path:
 
 def _read_datasets(cfg: QualityConfig, policy: ImaginingPolicy) -> tuple[list[Episode], list[Episode]]:
     """Episodes of the training data, if it is given, and those to judge on."""
-    config = world_model_config(policy)
-    read = partial(
-        read_demonstrations,
-        cameras=config.cameras,
-        seed=cfg.seed,
-        proprio=config.proprio_vectors,
-        reward_key=config.reward_key,
-    )
-    check_reads(config, cfg.dataset.metadata())
+    check_reads(world_model_config(policy), cfg.dataset.metadata())
     training = []
     if cfg.train_dataset is not None:
         tasks = _check_tasks(cfg.train_dataset, cfg.dataset)
-        training = read(cfg.train_dataset, per_task=PROBE_EPISODES_PER_TASK, of_tasks=tasks)
-    episodes = read(cfg.dataset, per_task=cfg.episodes_per_task)
-    n_long = sum(len(episode.actions) >= WINDOW for episode in episodes)
+        chosen = choose_episodes(cfg.train_dataset, PROBE_EPISODES_PER_TASK, cfg.seed, tasks)
+        training = load_episodes(policy, cfg.train_dataset, chosen)
+    chosen = choose_episodes(cfg.dataset, cfg.episodes_per_task, cfg.seed)
+    episodes = load_episodes(policy, cfg.dataset, chosen)
+    n_long = sum(len(episode) >= WINDOW for episode in episodes)
     if n_long < 2:
         raise ValueError(
             f"{n_long} of the {len(episodes)} episodes chosen from {cfg.dataset.repo_id} have {WINDOW} frames or more; "
             "open-loop prediction with shuffled actions needs 2 of them."
         )
     return training, episodes
+
+
+def choose_episodes(
+    source: SourceConfig, per_task: int, seed: int, of_tasks: Collection[str] | None = None
+) -> list[int]:
+    """Choose up to `per_task` episodes of each task, or of some tasks, spread evenly over its variations.
+
+    Returns:
+        Sorted episode indices.
+    """
+    dataset = LeRobotDataset(source.repo_id, root=source.root, revision=source.revision)
+    # Where it is not known which episodes begin alike, each counts as a variation of its own.
+    variation = VARIATION if VARIATION in dataset.meta.features else "episode_index"
+    keys = {"episode_index": "episode_index", "task_index": "task_index", "variation": variation}
+    columns = {name: column_tensor(dataset.hf_dataset, key, (1,)).numpy() for name, key in keys.items()}
+    table = pd.DataFrame(columns).drop_duplicates("episode_index")
+    if of_tasks is not None:
+        names = [str(task) for task in dataset.meta.tasks.index]
+        table = table[table["task_index"].isin([i for i, task in enumerate(names) if task in of_tasks])]
+    return spread_over_variations(table, per_task, seed)
+
+
+def spread_over_variations(episodes: pd.DataFrame, per_task: int, seed: int) -> list[int]:
+    """Choose rows of a table of `episode_index`, `task_index` and `variation`, see `choose_episodes`."""
+    shuffled = episodes.sample(frac=1, random_state=seed)
+    turn = shuffled.groupby(["task_index", "variation"]).cumcount()
+    by_turn = shuffled.iloc[turn.argsort(kind="stable")]
+    return sorted(by_turn.groupby("task_index").head(per_task)["episode_index"].tolist())
 
 
 def _check_tasks(training: SourceConfig, judged_on: SourceConfig) -> list[str]:
@@ -187,8 +217,8 @@ def _check_tasks(training: SourceConfig, judged_on: SourceConfig) -> list[str]:
 
 def _count_seen(training: list[Episode], episodes: list[Episode]) -> int:
     """Count episodes that start from positions that training episodes start from; warns if there are any."""
-    trained_on = set(start_positions(training))
-    n_seen = sum(position in trained_on for position in start_positions(episodes))
+    trained_on = {(episode.task, start_positions(episode)) for episode in training}
+    n_seen = sum((episode.task, start_positions(episode)) in trained_on for episode in episodes)
     if n_seen:
         logger.warning(
             "%d of %d episodes start from positions of the training data: the results are too good. Collect others.",

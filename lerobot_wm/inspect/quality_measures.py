@@ -7,10 +7,11 @@ from sklearn.metrics import average_precision_score, roc_auc_score
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from lerobot_wm.constants import SUCCESS
+from lerobot_wm.encode.episodes import Episode
+from lerobot_wm.inspect.episodes import Filtered, imagine
 from lerobot_wm.inspect.open_loop import CONTEXT, HORIZONS, WINDOW, psnr
-from lerobot_wm.inspect.quality_episodes import Episode, Filtered
 from lerobot_wm.world_model.model import WorldModel
-from lerobot_wm.world_model.rssm import RSSMState
 
 # What is compared, in the order shown.
 PREDICTIONS = ("open loop", "shuffled actions", "copy last frame", "mean image", "closed loop")
@@ -53,19 +54,14 @@ def predictions(
     device = world_model.action_scaling.offset.device
     ahead = [CONTEXT - 1 + horizon for horizon in HORIZONS]
     columns = [horizon - 1 for horizon in HORIZONS]
-    context = RSSMState(
-        torch.stack([loop.states.deter[CONTEXT - 1] for loop in filtered]).to(device),
-        torch.stack([loop.states.stoch[CONTEXT - 1] for loop in filtered]).to(device),
-    )  # (E, ·)
-    # The action executed at the last frame seen leads to the first imagined one.
     actions = torch.stack([episode.actions[CONTEXT - 1 : WINDOW - 1] for episode in episodes])  # (E, 45, A)
     order = np.random.default_rng(seed).permutation(len(episodes))
     others = torch.empty_like(actions)
     # A single cycle: no episode keeps its own actions.
     others[order] = actions[np.roll(order, 1)]
 
-    def imagine(under: Tensor) -> Tensor:
-        latents = world_model.imagine(context, under.to(device)).latent[:, columns]
+    def under(chosen: Tensor) -> Tensor:
+        latents = imagine(world_model, filtered, CONTEXT - 1, chosen)[:, columns]
         return world_model.decode(latents).cpu()
 
     latents = torch.stack([loop.latents[ahead] for loop in filtered])  # (E, H, D+S)
@@ -73,8 +69,8 @@ def predictions(
     last_seen = torch.stack([episode.images([CONTEXT - 1]) for episode in episodes])  # (E, 1, C, 64, 64)
     return {
         "truth": truth,
-        "open loop": imagine(actions),
-        "shuffled actions": imagine(others),
+        "open loop": under(actions),
+        "shuffled actions": under(others),
         "copy last frame": last_seen.expand_as(truth),
         "mean image": mean_image.expand_as(truth),
         "closed loop": world_model.decode(latents.to(device)).cpu(),
@@ -144,26 +140,31 @@ def summarise(errors: pd.DataFrame) -> list[dict]:
 
 
 @torch.no_grad()
-def reward_quality(world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered]) -> list[dict]:
+def reward_quality(
+    world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered], reward_key: str
+) -> list[dict] | None:
     """How well the predicted reward ranks successful steps above others, per task and over all tasks.
 
-    The episodes' `success` is known.
+    None where the dataset does not say which steps succeed: it has no `next.success`, and no reward of 0 and 1.
 
     s_t predicts the reward r_{t-1} that arrived with o_t; the label is `next.success` of frame t - 1, so that models of
     any reward can be compared. By chance AUROC is 0.5 and average precision the base rate; both are None where all
     steps succeed or all fail.
     """
     device = world_model.action_scaling.offset.device
+    key = SUCCESS if SUCCESS in episodes[0].columns else reward_key
+    success = [episode.columns[key] for episode in episodes if key in episode.columns]
+    if not success or not all(((values == 0) | (values == 1)).all() for values in success):
+        return None
     steps = pd.concat(
         pd.DataFrame(
             {
                 "task": episode.task,
                 "score": world_model.predict_reward(loop.latents[1:].to(device)).cpu().numpy(),
-                "success": episode.success[:-1].numpy(),
+                "success": values[:-1].flatten().bool().numpy(),
             }
         )
-        for episode, loop in zip(episodes, filtered, strict=True)
-        if episode.success is not None
+        for episode, loop, values in zip(episodes, filtered, success, strict=True)
     )
     rows = []
     for task, group in _with_all_tasks(steps).groupby("task", sort=False):
@@ -224,7 +225,7 @@ def drift(
     """
     tables = []
     for episode, loop in zip(episodes, filtered, strict=True):
-        steps = min(len(episode.actions), DRIFT_STEPS)
+        steps = min(len(episode), DRIFT_STEPS)
         truth = episode.images(slice(steps))  # (T, C, 64, 64)
         restarted = torch.full((steps,), torch.nan)
         if steps >= window_length:

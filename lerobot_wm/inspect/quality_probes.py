@@ -12,9 +12,12 @@ from sklearn.metrics import r2_score
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
+from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wm.inspect.quality_episodes import POSITIONS, Episode, Filtered
+from lerobot_wm.constants import ENV_STATE_DIM, OBS_ENV_STATE, VARIATION
+from lerobot_wm.encode.episodes import Episode
+from lerobot_wm.inspect.episodes import Filtered
 
 logger = logging.getLogger(__name__)
 
@@ -24,6 +27,8 @@ BLIND = "no image"
 REPRESENTATIONS = (LATENT, EMBEDDING, UNTRAINED, PIXELS, BLIND)
 MEAN_OF_TASKS = "mean of tasks"
 
+# Meta-World's 39-dimensional state (m): hand and first object at its start, the goal at its end.
+POSITIONS = {"object": slice(4, 7), "gripper": slice(0, 3), "goal": slice(36, 39)}
 FRAMES_PER_EPISODE = 15
 FOLDS = 5
 # Ridge penalties, for standardised features and some hundred frames: wide enough that the best one for latents,
@@ -55,6 +60,30 @@ class Frames:
     to_fit: np.ndarray | None
 
 
+def probe_targets(episode: Episode) -> dict[str, Tensor]:
+    """What probes read from the latent, (T, ·) by name.
+
+    These are Meta-World's positions in m where `lerobot-wm collect` recorded them, elsewhere the observation's vectors.
+    """
+    state = episode.columns.get(OBS_ENV_STATE)
+    if VARIATION in episode.columns and state is not None and state.shape[1] == ENV_STATE_DIM:
+        return {name: state[:, place] for name, place in POSITIONS.items()}
+    return {
+        key: values.flatten(1) for key, values in episode.columns.items() if key.startswith("observation.")
+    }
+
+
+def variation_of(episode: Episode) -> int:
+    """The episode's variation; elsewhere its index, as it is not known which episodes begin alike."""
+    return int(episode.columns[VARIATION][0]) if VARIATION in episode.columns else episode.index
+
+
+def start_positions(episode: Episode) -> tuple[float, ...]:
+    """Object and goal at the first frame in Meta-World: equal to the bit for equal variations."""
+    targets = probe_targets(episode)
+    return tuple(x for name in ("object", "goal") for x in targets[name][0].tolist())
+
+
 def draw_frames(
     episodes: list[Episode], filtered: list[Filtered], untrained: list[Filtered], n_fit: int, seed: int
 ) -> Frames:
@@ -72,9 +101,7 @@ def draw_frames(
     """
     rng = np.random.default_rng(seed)
     picks = [
-        np.sort(
-            rng.choice(len(episode.actions), min(FRAMES_PER_EPISODE, len(episode.actions)), replace=False)
-        )
+        np.sort(rng.choice(len(episode), min(FRAMES_PER_EPISODE, len(episode)), replace=False))
         for episode in episodes
     ]
     counts = [len(pick) for pick in picks]
@@ -96,6 +123,7 @@ def draw_frames(
     fitted_to = pixels[to_fit] if n_fit else pixels
     pca = PCA(min(latents.shape[1], *fitted_to.shape), svd_solver="randomized", random_state=seed)
     pca.fit(fitted_to)
+    targets = [probe_targets(episode) for episode in episodes]
     features = {
         LATENT: latents,
         EMBEDDING: gather([loop.embeds.numpy() for loop in filtered]),  # (N, E)
@@ -105,12 +133,9 @@ def draw_frames(
     }
     return Frames(
         features={name: x.astype(np.float64) for name, x in features.items()},
-        targets={
-            name: gather([episode.targets[name].numpy() for episode in episodes])
-            for name in episodes[0].targets
-        },
+        targets={name: gather([of_episode[name].numpy() for of_episode in targets]) for name in targets[0]},
         tasks=per_frame([episode.task for episode in episodes]),
-        variations=per_frame([episode.variation for episode in episodes]),
+        variations=per_frame([variation_of(episode) for episode in episodes]),
         to_fit=to_fit if n_fit else None,
     )
 

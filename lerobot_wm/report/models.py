@@ -10,10 +10,10 @@ import pandas as pd
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from tqdm import tqdm
 
-from lerobot_wm.constants import TASK
 from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.encode.episodes import Episode
 from lerobot_wm.inspect.dream import Dreams, actions_are_targets, dream, strip_figure, write_dream
-from lerobot_wm.inspect.episodes import ImaginingPolicy, episodes_by_task, read_episodes
+from lerobot_wm.inspect.episodes import ImaginingPolicy, episodes_by_task, load_episodes
 from lerobot_wm.inspect.open_loop import CONTEXT
 from lerobot_wm.inspect.pictures import MP4, PNG, SVG, data_uri, figure_uri
 from lerobot_wm.inspect.quality_figures import (
@@ -70,22 +70,22 @@ def dream_clips(
     chosen = sorted(episodes[-1] for episodes in list(by_task.values())[:MAX_DREAMS])
     if not chosen:
         return []
-    episodes = read_episodes(policy, meta, source, chosen, MAX_FRAMES)
+    episodes = load_episodes(policy, source, chosen, MAX_FRAMES)
     hold = actions_are_targets(meta)
     return [
-        _clip(dream(policy, episode, CONTEXT, hold_action=hold), episode[TASK], index, meta.fps)
-        for index, episode in zip(tqdm(chosen, desc="Dreaming", unit="episode"), episodes, strict=True)
+        _clip(dream(policy, episode, CONTEXT, hold_action=hold), episode, meta.fps)
+        for episode in tqdm(episodes, desc="Dreaming", unit="episode")
     ]
 
 
-def _clip(dreams: Dreams, task: str, episode: int, fps: int) -> DreamClip:
+def _clip(dreams: Dreams, episode: Episode, fps: int) -> DreamClip:
     with TemporaryDirectory() as folder:
         path = Path(folder, "dream.mp4")
         write_dream(path, dreams, fps)
         video = path.read_bytes()
     return DreamClip(
-        task=task,
-        episode=episode,
+        task=episode.task,
+        episode=episode.index,
         n_imagined=dreams.n_imagined,
         kinds=list(dreams.by_actions),
         psnr=dreams.psnr(),

@@ -18,6 +18,7 @@ from PIL import Image
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE, REWARD, SUCCESS, TASK
 from lerobot_wm.data.source import SourceConfig
+from lerobot_wm.encode.episodes import Episode
 from lerobot_wm.inspect.dream import (
     OWN_ACTIONS,
     STEPS_SHOWN,
@@ -29,7 +30,13 @@ from lerobot_wm.inspect.dream import (
     video_frames,
 )
 from lerobot_wm.inspect.dream_command import DreamConfig, dream_of
-from lerobot_wm.inspect.episodes import CheckpointConfig, load_world_model, read_episodes, reward_key
+from lerobot_wm.inspect.episodes import (
+    CheckpointConfig,
+    ImaginingPolicy,
+    load_episodes,
+    load_world_model,
+    reward_key,
+)
 from lerobot_wm.nn.images import resize_images
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
@@ -134,52 +141,44 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: make_checkpoint(tmp_path_factory.mktemp(name), name) for name in types}
 
 
-def episode_of(root: Path, index: int) -> dict[str, Any]:
-    """An episode's frames as the command reads them, here one frame at a time."""
-    dataset = LeRobotDataset("test/dream", root=root)
-    start = sum(LENGTHS[:index])
-    frames = [dataset[start + t] for t in range(LENGTHS[index])]
-    stacked = {key: torch.stack([frame[key] for frame in frames]) for key in (*SIZES, OBS_STATE, ACTION)}
-    return stacked | {REWARD: torch.stack([frame[REWARD] for frame in frames]), TASK: frames[0][TASK]}
+def episode_of(policy: ImaginingPolicy, root: Path, index: int) -> Episode:
+    return load_episodes(policy, SourceConfig("test/dream", str(root)), [index])[0]
 
 
 @pytest.fixture(scope="module")
 def dreams(root: Path, checkpoints: dict[str, Path]) -> Dreams:
-    return dream(load_world_model(str(checkpoints["wm_bc"])), episode_of(root, 1), CONTEXT)
+    policy = load_world_model(str(checkpoints["wm_bc"]))
+    return dream(policy, episode_of(policy, root, 1), CONTEXT)
 
 
-def test_episodes_are_read_some_frames_at_a_time_and_at_the_models_size(
-    root: Path, checkpoints: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_episodes_are_read_at_the_models_size(root: Path, checkpoints: dict[str, Path]) -> None:
     policy, dataset = load_world_model(str(checkpoints["wm_rssm"])), LeRobotDataset("test/dream", root=root)
-    monkeypatch.setattr("lerobot_wm.inspect.episodes._FRAMES_AT_ONCE", 7)
-    first = 0
-    for episode, length in zip(
-        read_episodes(policy, dataset.meta, SourceConfig("test/dream", str(root)), [0, 1, 2], 20),
-        (9, 20, 3),
-        strict=True,
-    ):
-        frames = [dataset[first + t] for t in range(length)]
-        assert torch.equal(episode[ACTION], torch.stack([frame[ACTION] for frame in frames]))
-        for key in SIZES:
-            whole = resize_images(torch.stack([frame[key] for frame in frames]), (64, 64))
-            torch.testing.assert_close(episode[key], whole)
-        assert episode[TASK] == frames[0][TASK]
-        first += LENGTHS[frames[0]["episode_index"]]
+    read = load_episodes(policy, SourceConfig("test/dream", str(root)), [0, 1, 2], 20)
+    assert [len(episode) for episode in read] == [9, 20, 3]
+    for episode in read:
+        first = sum(LENGTHS[: episode.index])
+        frames = [dataset[first + t] for t in range(len(episode))]
+        for key in (ACTION, OBS_STATE):
+            assert torch.equal(episode.columns[key], torch.stack([frame[key] for frame in frames]))
+        of_cameras = [resize_images(torch.stack([frame[key] for frame in frames]), (64, 64)) for key in SIZES]
+        torch.testing.assert_close(episode.images(), torch.cat(of_cameras, dim=1))
+        assert episode.task == frames[0][TASK]
 
 
 @pytest.mark.parametrize("policy_type", ["wm_bc", "wm_iql"])
 @torch.no_grad()
 def test_dreams_equal_one_step_at_a_time(policy_type: str, root: Path, checkpoints: dict[str, Path]) -> None:
     policy = load_world_model(str(checkpoints[policy_type]))
-    episode = episode_of(root, 1)
+    episode = episode_of(policy, root, 1)
     dreams = dream(policy, episode, CONTEXT)
-    model, actions = policy.world_model, episode[ACTION]
+    model, actions = policy.world_model, episode.actions
+    dataset = LeRobotDataset("test/dream", root=root)
 
     # The policy's own filter sees the context, as in a rollout in which the episode's actions are executed.
     policy.reset()
     for t in range(CONTEXT):
-        frame = {key: episode[key][t : t + 1] for key in (*SIZES, OBS_STATE)} | {TASK: [episode[TASK]]}
+        item = dataset[LENGTHS[0] + t]
+        frame = {key: item[key][None] for key in (*SIZES, OBS_STATE)} | {TASK: [item[TASK]]}
         own = policy.select_action(frame)
         policy._prev_action = actions[t : t + 1]
     seen, held = policy._filter_state, frame[OBS_STATE]
@@ -212,13 +211,15 @@ def test_dreams_equal_one_step_at_a_time(policy_type: str, root: Path, checkpoin
 @pytest.mark.parametrize("key", [OBS_STATE, OBS_ENV_STATE])
 def test_the_policy_does_not_see_where_the_demonstration_goes(key: str, root: Path, tmp_path: Path) -> None:
     path = make_checkpoint(tmp_path, "wm_bc", use_environment_state=key == OBS_ENV_STATE)
-    policy, episode = load_world_model(str(path)), episode_of(root, 1)
-    episode[OBS_ENV_STATE] = torch.randn(LENGTHS[1], 5)
+    policy = load_world_model(str(path))
+    read = episode_of(policy, root, 1)
+    episode = replace(read, columns=read.columns | {OBS_ENV_STATE: torch.randn(LENGTHS[1], 5)})
 
     def own(changed_frame: int) -> torch.Tensor:
-        values = episode[key].clone()
+        values = episode.columns[key].clone()
         values[changed_frame] += 10
-        return dream(policy, episode | {key: values}, CONTEXT).by_actions[OWN_ACTIONS].images
+        changed = replace(episode, columns=episode.columns | {key: values})
+        return dream(policy, changed, CONTEXT).by_actions[OWN_ACTIONS].images
 
     same = dream(policy, episode, CONTEXT).by_actions[OWN_ACTIONS].images
     assert torch.equal(own(CONTEXT), same)
@@ -276,8 +277,8 @@ def test_a_policy_knows_the_reward_of_its_world_model(tmp_path: Path) -> None:
 
 
 def test_without_a_reward_head_there_is_no_curve(root: Path, tmp_path: Path) -> None:
-    path = make_checkpoint(tmp_path, "wm_rssm", predict_reward=False)
-    dreams = dream(load_world_model(str(path)), episode_of(root, 0), CONTEXT)
+    policy = load_world_model(str(make_checkpoint(tmp_path, "wm_rssm", predict_reward=False)))
+    dreams = dream(policy, episode_of(policy, root, 0), CONTEXT)
     assert list(dreams.by_actions) == [TRUE_ACTIONS, ZERO_ACTIONS]
     assert len(strip_figure(dreams).axes) == 3 * (LENGTHS[0] - CONTEXT + 1)
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_wm.constants import OBS_IMAGE
+from lerobot_wm.constants import REWARD, SUCCESS
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.inspect.quality_episodes import Episode, Filtered, filter_episodes, read_demonstrations
+from lerobot_wm.encode.episodes import Episode
+from lerobot_wm.inspect.episodes import Filtered, filter_episodes, load_episodes, load_world_model
 from lerobot_wm.inspect.quality_measures import drift, kl_quality, reward_quality
 from lerobot_wm.world_model.model import WorldModel
 from tests.extended.report.quality_model import lively_world_model
@@ -23,13 +24,19 @@ def world_model(world_model_path: Path) -> WorldModel:
 
 
 @pytest.fixture(scope="module")
-def episodes(demos_root: Path) -> list[Episode]:
-    return read_demonstrations(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=1, seed=0)
+def episodes(demos_root: Path, world_model_path: Path) -> list[Episode]:
+    """An episode of each of the two tasks."""
+    policy = load_world_model(str(world_model_path))
+    return load_episodes(policy, SourceConfig("test/demos", str(demos_root)), [0, 4])
 
 
 @pytest.fixture(scope="module")
 def filtered(world_model: WorldModel, episodes: list[Episode]) -> list[Filtered]:
     return filter_episodes(world_model, episodes)
+
+
+def succeeding(episode: Episode, success: torch.Tensor) -> Episode:
+    return replace(episode, columns=episode.columns | {SUCCESS: success})
 
 
 @torch.no_grad()
@@ -40,25 +47,32 @@ def test_reward_is_judged_at_the_step_it_belongs_to(
     scores = [world_model.predict_reward(loop.latents)[1:] for loop in filtered]
     threshold = torch.cat(scores).quantile(0.9)
     labelled = [
-        replace(episode, success=torch.cat([score > threshold, torch.tensor([False])]))
+        succeeding(episode, torch.cat([score > threshold, torch.tensor([False])]))
         for episode, score in zip(episodes, scores, strict=True)
     ]
-    *_, overall = reward_quality(world_model, labelled, filtered)
+    *_, overall = reward_quality(world_model, labelled, filtered, REWARD)
     assert overall["task"] == "all tasks"
     assert overall["n_steps"] == sum(len(score) for score in scores)
     assert overall["base_rate"] == pytest.approx(0.1, abs=0.01)
     assert (overall["auroc"], overall["average_precision"]) == pytest.approx((1, 1))
 
-    late = [replace(episode, success=episode.success.roll(1)) for episode in labelled]
-    assert reward_quality(world_model, late, filtered)[-1]["average_precision"] < 0.99
+    late = [succeeding(episode, episode.columns[SUCCESS].roll(1)) for episode in labelled]
+    assert reward_quality(world_model, late, filtered, REWARD)[-1]["average_precision"] < 0.99
 
 
 def test_steps_that_are_all_alike_rank_nothing(
     world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered]
 ) -> None:
-    failures = [replace(episode, success=torch.zeros_like(episode.success)) for episode in episodes]
-    for row in reward_quality(world_model, failures, filtered):
+    failures = [succeeding(episode, torch.zeros(len(episode))) for episode in episodes]
+    for row in reward_quality(world_model, failures, filtered, REWARD):
         assert (row["base_rate"], row["auroc"], row["average_precision"]) == (0, None, None)
+
+
+def test_a_dense_reward_says_nothing_of_success(
+    world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered]
+) -> None:
+    dense = [succeeding(episode, torch.linspace(0, 1, len(episode))) for episode in episodes]
+    assert reward_quality(world_model, dense, filtered, REWARD) is None
 
 
 def test_kl_statistics(episodes: list[Episode], filtered: list[Filtered]) -> None:
@@ -80,7 +94,7 @@ def test_drift_compares_with_a_filter_that_is_restarted(
     world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered]
 ) -> None:
     rows = drift(world_model, episodes[:1], filtered[:1], WINDOW)
-    images, actions = episodes[0].images(slice(None)), episodes[0].actions
+    images, actions = episodes[0].images(), episodes[0].actions
 
     def by_hand(begin: int, step: int) -> float:
         states = world_model.filter(images[None, begin : step + 1], actions[None, begin : step + 1])
@@ -100,6 +114,6 @@ def test_drift_compares_with_a_filter_that_is_restarted(
 def test_drift_counts_the_episodes_that_reach_a_step(
     world_model: WorldModel, episodes: list[Episode], filtered: list[Filtered]
 ) -> None:
-    lengths = sorted(min(len(episode.actions), 101) for episode in episodes)
+    lengths = sorted(min(len(episode), 101) for episode in episodes)
     rows = drift(world_model, episodes, filtered, WINDOW)
     assert [row["n_episodes"] for row in rows] == [2] * lengths[0] + [1] * (lengths[1] - lengths[0])

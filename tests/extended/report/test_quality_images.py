@@ -7,17 +7,12 @@ import pandas as pd
 import pytest
 import torch
 
-from lerobot_wm.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot_wm.constants import ACTION, OBS_STATE, SUCCESS
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.inspect.episodes import load_world_model
+from lerobot_wm.encode.episodes import Episode
+from lerobot_wm.inspect.episodes import filter_episodes, load_episodes, load_world_model
 from lerobot_wm.inspect.open_loop import WINDOW, predict
-from lerobot_wm.inspect.quality_episodes import (
-    Episode,
-    choose_episodes,
-    filter_episodes,
-    read_demonstrations,
-    start_positions,
-)
+from lerobot_wm.inspect.quality import spread_over_variations
 from lerobot_wm.inspect.quality_measures import (
     PREDICTIONS,
     image_errors,
@@ -25,13 +20,19 @@ from lerobot_wm.inspect.quality_measures import (
     predictions,
     summarise,
 )
+from lerobot_wm.inspect.quality_probes import probe_targets, start_positions, variation_of
 from tests.extended.report.quality_model import lively_world_model
 
 
 @pytest.fixture(scope="module")
-def episodes(demos_root: Path) -> list[Episode]:
-    chosen = read_demonstrations(SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=3, seed=0)
-    return [episode for episode in chosen if len(episode.actions) >= WINDOW]
+def all_episodes(demos_root: Path, world_model_path: Path) -> list[Episode]:
+    policy = load_world_model(str(world_model_path))
+    return load_episodes(policy, SourceConfig("test/demos", str(demos_root)), list(range(8)))
+
+
+@pytest.fixture(scope="module")
+def episodes(all_episodes: list[Episode]) -> list[Episode]:
+    return [episode for episode in all_episodes if len(episode) >= WINDOW]
 
 
 def test_errors_of_constructed_images() -> None:
@@ -70,7 +71,9 @@ def test_what_passes_by_is_in_the_mean_but_not_in_the_median_image(episodes: lis
     assert mean[0, 0, 0].item() == pytest.approx(140 / 255)
 
 
-def test_open_loop_is_that_of_the_report(world_model_path: Path, episodes: list[Episode]) -> None:
+def test_open_loop_is_that_of_the_report(
+    world_model_path: Path, demos_root: Path, episodes: list[Episode]
+) -> None:
     policy = load_world_model(str(world_model_path))
     policy.world_model = lively_world_model(world_model_path)
     one_task = [episode for episode in episodes if episode.task == episodes[-1].task]
@@ -82,11 +85,8 @@ def test_open_loop_is_that_of_the_report(world_model_path: Path, episodes: list[
     table = table.query("task != 'all tasks'")
 
     window = slice(WINDOW)
-    expected = predict(
-        policy,
-        one_task[0].task,
-        [{OBS_IMAGE: e.images(window), ACTION: e.actions[window]} for e in one_task],
-    )
+    source = SourceConfig("test/demos", str(demos_root))
+    expected = predict(policy, load_episodes(policy, source, [e.index for e in one_task], WINDOW))
     of = {name: table[table["prediction"] == name]["psnr"].tolist() for name in PREDICTIONS}
     assert of["open loop"] == pytest.approx(expected.psnr, abs=1e-3)
     assert of["copy last frame"] == pytest.approx(expected.copy_psnr, abs=1e-3)
@@ -102,7 +102,10 @@ def test_shuffled_actions_are_another_episodes(world_model_path: Path, episodes:
     two = [episodes[0], episodes[-1]]
     filtered = filter_episodes(world_model, two)
     mean, _ = mean_and_median_image(two)
-    swapped = [replace(two[0], actions=two[1].actions), replace(two[1], actions=two[0].actions)]
+    swapped = [
+        replace(episode, columns=episode.columns | {ACTION: other.actions})
+        for episode, other in (two, two[::-1])
+    ]
     images = predictions(world_model, two, filtered, mean, seed=0)
     shuffled = images["shuffled actions"]
     assert (shuffled - images["open loop"]).abs().max() > 0.01
@@ -116,11 +119,11 @@ def test_filtering_in_batches_is_filtering_one_by_one(
     world_model_path: Path, episodes: list[Episode]
 ) -> None:
     world_model = lively_world_model(world_model_path)
-    assert len({len(episode.actions) for episode in episodes}) > 1, "or nothing is padded"
+    assert len({len(episode) for episode in episodes}) > 1, "or nothing is padded"
     for episode, loop in zip(episodes, filter_episodes(world_model, episodes), strict=True):
-        states = world_model.filter(episode.images(slice(None))[None], episode.actions[None])
+        states = world_model.filter(episode.images()[None], episode.actions[None])
         torch.testing.assert_close(loop.latents, states.latent[0], atol=1e-5, rtol=1e-4)
-        assert loop.kl.shape == episode.success.shape
+        assert loop.kl.shape == episode.columns[SUCCESS].flatten().shape
         assert bool((loop.kl > 0).all())
 
 
@@ -130,28 +133,26 @@ def test_episodes_are_spread_over_variations() -> None:
         columns=["task_index", "variation"],
     ).rename_axis("episode_index")
     table = table.reset_index()
-    chosen = choose_episodes(table, per_task=7, seed=0)
+    chosen = spread_over_variations(table, per_task=7, seed=0)
     counts = table.set_index("episode_index").loc[chosen].value_counts().sort_index()
     assert counts.groupby("task_index").sum().tolist() == [7, 7]
     assert set(counts) == {1, 2}, "each of the 5 variations once, and two of them twice"
-    assert chosen == choose_episodes(table, per_task=7, seed=0)
-    assert chosen != choose_episodes(table, per_task=7, seed=1)
+    assert chosen == spread_over_variations(table, per_task=7, seed=0)
+    assert chosen != spread_over_variations(table, per_task=7, seed=1)
 
 
-def test_positions_tell_variations_apart(demos_root: Path) -> None:
-    episodes = read_demonstrations(
-        SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=4, seed=0
-    )
-    names = {(episode.task, episode.variation) for episode in episodes}
-    assert len(set(start_positions(episodes))) == len(names)
+def test_positions_tell_variations_apart(all_episodes: list[Episode]) -> None:
+    names = {(episode.task, variation_of(episode)) for episode in all_episodes}
+    starts = {(episode.task, start_positions(episode)) for episode in all_episodes}
+    assert len(starts) == len(names)
 
 
-def test_a_dataset_without_positions_has_its_vectors_as_targets(episodes_root: Path) -> None:
+def test_a_dataset_without_positions_has_its_vectors_as_targets(
+    episodes_root: Path, world_model_path: Path
+) -> None:
     source = SourceConfig("test/episodes", str(episodes_root))
-    episodes = read_demonstrations(source, [OBS_IMAGE], per_task=1, seed=0, proprio=[OBS_STATE])
+    episodes = load_episodes(load_world_model(str(world_model_path)), source, [0, 3])
     for episode in episodes:
-        assert list(episode.targets) == [OBS_STATE]
-        assert episode.targets[OBS_STATE].shape == episode.actions.shape
-        assert torch.equal(episode.proprio, episode.targets[OBS_STATE])
-        assert episode.success is None
-    assert len({episode.variation for episode in episodes}) == len(episodes)
+        assert list(probe_targets(episode)) == [OBS_STATE]
+        assert probe_targets(episode)[OBS_STATE].shape == episode.actions.shape
+    assert [variation_of(episode) for episode in episodes] == [0, 3]

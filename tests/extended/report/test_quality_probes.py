@@ -6,10 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lerobot_wm.constants import OBS_IMAGE
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.inspect.episodes import load_world_model
-from lerobot_wm.inspect.quality_episodes import POSITIONS, filter_episodes, read_demonstrations
+from lerobot_wm.inspect.episodes import filter_episodes, load_episodes, load_world_model
 from lerobot_wm.inspect.quality_probes import (
     BLIND,
     EMBEDDING,
@@ -17,10 +15,12 @@ from lerobot_wm.inspect.quality_probes import (
     LATENT,
     MEAN_OF_TASKS,
     PIXELS,
+    POSITIONS,
     UNTRAINED,
     Frames,
     draw_frames,
     probe_positions,
+    probe_targets,
     probe_task,
     splits,
 )
@@ -143,15 +143,14 @@ def test_one_task_needs_no_probe(frames: Frames) -> None:
 
 
 def test_frames_of_real_episodes(demos_root: Path, world_model_path: Path) -> None:
-    world_model = load_world_model(str(world_model_path)).world_model
-    episodes = read_demonstrations(
-        SourceConfig("test/demos", str(demos_root)), [OBS_IMAGE], per_task=2, seed=0
-    )
+    policy = load_world_model(str(world_model_path))
+    world_model = policy.world_model
+    episodes = load_episodes(policy, SourceConfig("test/demos", str(demos_root)), [0, 1, 4, 5])
     filtered = filter_episodes(world_model, episodes)
     frames = draw_frames(episodes, filtered, filtered, n_fit=2, seed=0)
     assert frames.to_fit.tolist() == [i < 2 for i in range(4) for _ in range(FRAMES_PER_EPISODE)]
     rows = {tuple(row) for row in frames.targets["goal"][:FRAMES_PER_EPISODE].tolist()}
-    assert rows <= {tuple(row) for row in episodes[0].targets["goal"].tolist()}
+    assert rows <= {tuple(row) for row in probe_targets(episodes[0])["goal"].tolist()}
     assert frames.features[PIXELS].shape == frames.features[LATENT].shape
     # Components keep their proportions: scaled to equal variance, the least of them would drown the first.
     variances = frames.features[PIXELS][frames.to_fit].var(axis=0, ddof=1)
