@@ -3,8 +3,10 @@
 import io
 from base64 import b64encode
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import LogFormatter
 
 SVG, PNG, WEBP, MP4 = "image/svg+xml", "image/png", "image/webp", "video/mp4"
 MAX_NAME_LENGTH = 32
@@ -18,6 +20,13 @@ def data_uri(content: bytes, mime_type: str) -> str:
 def shorten(name: str) -> str:
     """Cut a name so that it leaves room for the figure beside it."""
     return name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…"
+
+
+def log_scale(axes: Axes) -> None:
+    """Make the vertical axis logarithmic, its numbers without mathematics, which `figure_bytes` does not typeset."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(LogFormatter())
 
 
 def figure_bytes(figure: Figure, mime_type: str) -> bytes:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from lerobot_wm.inspect.open_loop import HORIZONS
+from lerobot_wm.inspect.pictures import log_scale
 
 EXAMPLES_NAME = "quality_examples.png"
 EXAMPLE_HORIZON = 20
@@ -117,7 +118,7 @@ def _drift_figure(table: pd.DataFrame, restart: int) -> Figure:
     style = {"color": _COLOURS[1], "linewidth": 1.2, "label": f"restarted {restart - 1} steps before"}
     left.plot(table["step"], table["restarted_psnr"], "--", **style)
     right.plot(table["step"], table["kl"], color=_COLOURS[0], linewidth=1.2)
-    right.set_yscale("log")
+    log_scale(right)
     for axes, label in ((left, "reconstruction PSNR (dB)"), (right, "KL per step (nats)")):
         axes.axvline(restart, color="#7a7a7a", linewidth=0.8, linestyle="--")
         axes.set_xlabel("step of the episode", fontsize=8)

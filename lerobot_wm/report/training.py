@@ -20,7 +20,7 @@ from lerobot_wm.data.cache import frame_shape
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import episodes_by_task
-from lerobot_wm.inspect.pictures import WEBP, data_uri, shorten
+from lerobot_wm.inspect.pictures import WEBP, data_uri, log_scale, shorten
 from lerobot_wm.policies.common.iql import reward_columns
 
 # Of the first frames shown, in pixels.
@@ -219,7 +219,7 @@ def _figure(name: str, runs: dict[str, Curves]) -> Figure:
     lowest, highest = axes.dataLim.ymin, axes.dataLim.ymax
     # Otherwise a loss's first steps would hide the rest.
     if lowest > 0 and highest > 10 * lowest:
-        axes.set_yscale("log")
+        log_scale(axes)
     axes.set_title(name, fontsize=10)
     axes.set_xlabel("step", fontsize=8)
     axes.tick_params(labelsize=8)

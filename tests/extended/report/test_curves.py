@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_wm.inspect.pictures import SVG, figure_bytes
 from lerobot_wm.report.training import curve_figures, read_logs
 
 
@@ -53,3 +54,15 @@ def test_runs_may_be_given_by_absolute_and_relative_paths(
 
 def test_no_runs_have_no_curves() -> None:
     assert curve_figures(read_logs([])) == []
+
+
+def test_numbers_of_a_logarithmic_axis_can_be_read(tmp_path: Path) -> None:
+    """Names may contain $, so no text in a figure is typeset as mathematics."""
+    run = write_log(tmp_path / "wm_rssm")
+    entries = [{"step": step, "loss": loss} for step, loss in ((1, 500), (2, 1.5))]
+    (run / "train_log.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    [figure] = curve_figures(read_logs([run]))
+    figure_bytes(figure, SVG)
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert "100" in labels
+    assert not any("$" in label for label in labels)
