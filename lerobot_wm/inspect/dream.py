@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from lerobot_wm.data.tables import last_action_predicts_next, relative_to_state
 from lerobot_wm.encode.episodes import Episode
 from lerobot_wm.inspect.episodes import ImaginingPolicy, filter_episodes, imagine, reward_key, rssm_of
 from lerobot_wm.inspect.open_loop import psnr
+from lerobot_wm.inspect.pictures import draw_pictures, tidy
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.world_model.rssm import RSSMState
 
@@ -193,16 +193,12 @@ def strip_figure(dreams: Dreams) -> Figure:
     grid = figure.add_gridspec(
         len(rows) + has_reward, len(steps), height_ratios=[cell_height] * len(rows) + [1.8] * has_reward
     )
-    for row, (name, images) in enumerate(rows.items()):
-        for column, step in enumerate(steps):
-            axes = figure.add_subplot(grid[row, column])
-            axes.imshow(images[dreams.context - 1 + step], interpolation="nearest")
-            axes.set_xticks([])
-            axes.set_yticks([])
-            if row == 0:
-                axes.set_title(f"+{step}" if step else "last seen", fontsize=9)
-            if column == 0:
-                axes.set_ylabel(fill(name, 10), fontsize=9, rotation=0, ha="right", va="center")
+    axes = np.array(
+        [[figure.add_subplot(grid[row, column]) for column in range(len(steps))] for row in range(len(rows))]
+    )
+    draw_pictures(axes, [(name, list(images[dreams.context - 1 + steps])) for name, images in rows.items()])
+    for axis, step in zip(axes[0], steps, strict=True):
+        axis.set_title(f"+{step}" if step else "last seen", fontsize=9)
     if has_reward:
         _draw_rewards(figure.add_subplot(grid[-1, :]), dreams)
         figure.legend(loc="outside lower center", ncols=5, fontsize=8)
@@ -223,8 +219,7 @@ def _draw_rewards(axes: Axes, dreams: Dreams) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("step of the episode", fontsize=8)
     axes.set_ylabel("reward", fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.grid(alpha=0.3)
+    tidy(axes)
 
 
 def write_dream(path: Path, dreams: Dreams, fps: int) -> None:

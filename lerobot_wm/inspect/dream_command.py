@@ -11,7 +11,13 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.evaluate.wandb_log import wandb_run
 from lerobot_wm.inspect.dream import Dreams, actions_are_targets, dream, strip_figure, write_dream
-from lerobot_wm.inspect.episodes import CheckpointConfig, check_features, load_episodes, load_world_model
+from lerobot_wm.inspect.episodes import (
+    CheckpointConfig,
+    check_episodes,
+    check_features,
+    load_episodes,
+    load_world_model,
+)
 from lerobot_wm.inspect.open_loop import CONTEXT
 from lerobot_wm.inspect.pictures import PNG, figure_bytes
 from lerobot_wm.policies.common.checkpoint import split_revision
@@ -79,11 +85,7 @@ def dream_of(cfg: DreamConfig) -> Dreams:
 
 def _count_frames(cfg: DreamConfig, meta: LeRobotDatasetMetadata) -> int:
     """How many frames of the episode are seen and imagined."""
-    if not 0 <= cfg.episode < meta.total_episodes:
-        raise ValueError(
-            f"--episode={cfg.episode}: {meta.repo_id} has {meta.total_episodes} episodes. Give one of 0 to "
-            f"{meta.total_episodes - 1}."
-        )
+    check_episodes(meta, [cfg.episode])
     length = meta.episodes[cfg.episode]["length"]
     n_frames = length if cfg.horizon is None else cfg.context + cfg.horizon
     if not 1 <= cfg.context < n_frames <= length:

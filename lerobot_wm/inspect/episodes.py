@@ -1,5 +1,6 @@
 """World models that imagine images, and what they make of recorded episodes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -72,6 +73,19 @@ def check_features(policy: ImaginingPolicy, meta: LeRobotDatasetMetadata) -> Non
     check_reads(policy.config, meta)
     # `check_reads` accepts latents in place of cameras.
     check_cameras_present(policy.config, meta.camera_keys, meta.repo_id)
+
+
+def check_episodes(meta: LeRobotDatasetMetadata, episodes: Sequence[int]) -> None:
+    """Check that a dataset has these episodes, and that there are any.
+
+    Raises:
+        ValueError: One does not exist.
+    """
+    if not episodes or not set(episodes) <= set(range(meta.total_episodes)):
+        raise ValueError(
+            f"{meta.repo_id} has {meta.total_episodes} episodes, not {list(episodes)}: give some of 0 to "
+            f"{meta.total_episodes - 1}."
+        )
 
 
 def episodes_by_task(meta: LeRobotDatasetMetadata, min_length: int = 1) -> dict[str, list[int]]:

@@ -3,7 +3,6 @@
 import logging
 import math
 from dataclasses import dataclass
-from textwrap import fill
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from lerobot_wm.inspect.episodes import (
     load_episodes,
     rssm_of,
 )
+from lerobot_wm.inspect.pictures import draw_pictures
 from lerobot_wm.nn.images import side_by_side
 from lerobot_wm.tables import Measurement, ReportTable
 
@@ -139,17 +139,12 @@ def strips_figure(results: list[OpenLoop]) -> Figure:
     figsize = (1.3 * width / height * (len(HORIZONS) + 1), 2.75 * len(results))
     figure = Figure(figsize=figsize, layout="constrained")
     axes = figure.subplots(2 * len(results), len(HORIZONS) + 1, squeeze=False)
-    for axis in axes.flat:
-        axis.axis("off")
-    steps = (0, *HORIZONS)
-    for result, (above, below) in zip(results, axes.reshape(len(results), 2, -1), strict=True):
-        for axis, step in zip(above, steps, strict=True):
-            axis.imshow(np.moveaxis(result.truth[CONTEXT - 1 + step], 0, -1))
-            axis.set_title(f"+{step}" if step else "last seen", fontsize=8)
-        for axis, step in zip(below[1:], HORIZONS, strict=True):
-            axis.imshow(np.moveaxis(result.imagined[step - 1], 0, -1))
-        transform = below[0].transAxes
-        name = below[0].text(0, 0.5, fill(result.task, 14), fontsize=8, transform=transform, va="center")
-        # Without this a long name would widen its column.
-        name.set_in_layout(False)
+    rows: list[tuple[str, list[np.ndarray | None]]] = []
+    for result in results:
+        truth, imagined = (np.moveaxis(images, 1, -1) for images in (result.truth, result.imagined))
+        rows.append((result.task, [truth[CONTEXT - 1 + step] for step in (0, *HORIZONS)]))
+        rows.append(("imagined", [None, *(imagined[step - 1] for step in HORIZONS)]))
+    draw_pictures(axes, rows)
+    for axis, step in zip(axes[0], (0, *HORIZONS), strict=True):
+        axis.set_title(f"+{step}" if step else "last seen", fontsize=8)
     return figure

@@ -2,7 +2,10 @@
 
 import io
 from base64 import b64encode
+from collections.abc import Sequence
+from textwrap import fill
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -20,6 +23,26 @@ def data_uri(content: bytes, mime_type: str) -> str:
 def shorten(name: str) -> str:
     """Cut a name so that it leaves room for the figure beside it."""
     return name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…"
+
+
+def draw_pictures(axes: np.ndarray, rows: Sequence[tuple[str, Sequence[np.ndarray | None]]]) -> None:
+    """Draw rows of pictures (H, W, C) on a grid of axes (R, N), each row's name to its left; None leaves a gap."""
+    for row, (name, pictures) in zip(axes, rows, strict=True):
+        for axis, picture in zip(row, pictures, strict=True):
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if picture is None:
+                axis.spines[:].set_visible(False)
+            else:
+                axis.imshow(picture, interpolation="nearest")
+        row[0].set_ylabel(fill(name, 14), fontsize=8, rotation=0, ha="right", va="center")
+
+
+def tidy(axes: Axes, title: str = "") -> None:
+    """Give a panel of curves its title, small numbers and a pale grid."""
+    axes.set_title(title, fontsize=10)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.3)
 
 
 def log_scale(axes: Axes) -> None:

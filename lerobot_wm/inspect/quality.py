@@ -65,9 +65,9 @@ class QualityConfig:
         world_model_path: Folder or Hub id of a wm_rssm, wm_bc or wm_iql checkpoint.
         dataset: Episodes to judge it on, that it was not trained on; in Meta-World of other variations.
         output_dir: Where quality.json and the figures are written.
-        train_dataset: What it was trained on: probes are fitted to its episodes of the tasks of `dataset`, all of which
-            it must have. Without it, probes are fitted and tested on `dataset` by cross-validation over variations, or
-            over episodes where the dataset has none.
+        train_dataset: What it was trained on: probes are fitted to its episodes of the tasks of `dataset`. Without it,
+            probes are fitted and tested on `dataset` by cross-validation over variations, or over episodes where the
+            dataset has none.
         seed: Seed of every random choice.
         episodes_per_task: Episodes of each task of `dataset`, spread over its variations.
     """
@@ -153,8 +153,13 @@ def _read_datasets(cfg: QualityConfig, policy: ImaginingPolicy) -> tuple[list[Ep
     check_reads(world_model_config(policy), cfg.dataset.metadata())
     training = []
     if cfg.train_dataset is not None:
-        tasks = _check_tasks(cfg.train_dataset, cfg.dataset)
+        tasks = list(episodes_by_task(cfg.dataset.metadata()))
         chosen = choose_episodes(cfg.train_dataset, PROBE_EPISODES_PER_TASK, cfg.seed, tasks)
+        if not chosen:
+            raise ValueError(
+                f"{cfg.train_dataset.repo_id} has no episode of {', '.join(tasks)}: the tasks "
+                f"of {cfg.dataset.repo_id}. Give what the world model was trained on, or leave out --train_dataset."
+            )
         training = load_episodes(policy, cfg.train_dataset, chosen)
     chosen = choose_episodes(cfg.dataset, cfg.episodes_per_task, cfg.seed)
     episodes = load_episodes(policy, cfg.dataset, chosen)
@@ -193,26 +198,6 @@ def spread_over_variations(episodes: pd.DataFrame, per_task: int, seed: int) -> 
     turn = shuffled.groupby(["task_index", "variation"]).cumcount()
     by_turn = shuffled.iloc[turn.argsort(kind="stable")]
     return sorted(by_turn.groupby("task_index").head(per_task)["episode_index"].tolist())
-
-
-def _check_tasks(training: SourceConfig, judged_on: SourceConfig) -> list[str]:
-    """The tasks to judge on; warns of tasks of the training data that are not among them.
-
-    Raises:
-        ValueError: The training data lacks a task to judge on.
-    """
-    trained, judged = (list(episodes_by_task(source.metadata())) for source in (training, judged_on))
-    missing = [task for task in judged if task not in trained]
-    if missing:
-        raise ValueError(
-            f"Probes of a task are fitted to its training data, but {training.repo_id} has no episode of "
-            f"{', '.join(missing)}; it has {', '.join(trained)}. Give a --dataset of tasks that the world model was "
-            "trained on, or leave out --train_dataset to use cross-validation."
-        )
-    left_out = [task for task in trained if task not in judged]
-    if left_out:
-        logger.warning("%s is not judged: %s has no episode of it.", ", ".join(left_out), judged_on.repo_id)
-    return judged
 
 
 def _count_seen(training: list[Episode], episodes: list[Episode]) -> int:

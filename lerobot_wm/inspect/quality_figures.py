@@ -3,13 +3,13 @@
 from textwrap import fill
 from typing import Any
 
+import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from lerobot_wm.inspect.open_loop import HORIZONS
-from lerobot_wm.inspect.pictures import log_scale
+from lerobot_wm.inspect.pictures import draw_pictures, log_scale, tidy
 
 EXAMPLES_NAME = "quality_examples.png"
 EXAMPLE_HORIZON = 20
@@ -42,14 +42,12 @@ def examples_figure(images: dict[str, Tensor], tasks: list[str]) -> Figure:
     figsize = (1.5 * width / height * (len(columns) + 0.8), 1.6 * len(names))
     figure = Figure(figsize=figsize, layout="constrained")
     axes = figure.subplots(len(names), len(columns), squeeze=False)
-    for row, task in zip(axes, names, strict=True):
-        episode = tasks.index(task)
-        row[0].set_ylabel(fill(task, 16), fontsize=8, rotation=0, ha="right", va="center")
-        for axis, column in zip(row, columns, strict=True):
-            image = images[column][episode, HORIZONS.index(EXAMPLE_HORIZON)].movedim(0, -1)  # (h, w, C)
-            axis.imshow(image.numpy(), interpolation="nearest")
-            axis.set_xticks([])
-            axis.set_yticks([])
+    place = HORIZONS.index(EXAMPLE_HORIZON)
+
+    def pictures(episode: int) -> list[np.ndarray]:
+        return [images[column][episode, place].movedim(0, -1).numpy() for column in columns]
+
+    draw_pictures(axes, [(task, pictures(tasks.index(task))) for task in names])
     for axis, column in zip(axes[0], columns, strict=True):
         axis.set_title("last seen" if column == "copy last frame" else column, fontsize=9)
     return figure
@@ -66,7 +64,7 @@ def _open_loop_figure(table: pd.DataFrame) -> Figure:
             style = {"color": colour, "markersize": 3, "linewidth": 1.2, "label": prediction}
             axes.plot(group["horizon"], group[column], "o-", **style)
         axes.set_xlabel("steps ahead", fontsize=8)
-        _tidy(axes, label)
+        tidy(axes, label)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return figure
 
@@ -88,7 +86,7 @@ def _probes_figure(table: pd.DataFrame) -> Figure:
         axes.set_xlim(left=0)
         axes.set_xlabel(f"median error ({unit})", fontsize=8)
         axes.set_yticks(range(len(tasks)), [fill(task, 30) for task in tasks])
-        _tidy(axes, target)
+        tidy(axes, target)
     panels[0].invert_yaxis()
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return figure
@@ -106,7 +104,7 @@ def _kl_figure(kl: dict[str, Any]) -> Figure:
     axes.axvline(kl["free_nats"], color=_COLOURS[1], linewidth=1.2, label="free nats")
     axes.set_xlabel("KL(posterior || prior) per step (nats)", fontsize=8)
     axes.legend(fontsize=8)
-    _tidy(axes, "steps")
+    tidy(axes, "steps")
     return figure
 
 
@@ -122,12 +120,6 @@ def _drift_figure(table: pd.DataFrame, restart: int) -> Figure:
     for axes, label in ((left, "reconstruction PSNR (dB)"), (right, "KL per step (nats)")):
         axes.axvline(restart, color="#7a7a7a", linewidth=0.8, linestyle="--")
         axes.set_xlabel("step of the episode", fontsize=8)
-        _tidy(axes, label)
+        tidy(axes, label)
     left.legend(fontsize=8)
     return figure
-
-
-def _tidy(axes: Axes, title: str) -> None:
-    axes.set_title(title, fontsize=10)
-    axes.tick_params(labelsize=8)
-    axes.grid(alpha=0.3)

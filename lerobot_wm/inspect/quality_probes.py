@@ -148,21 +148,25 @@ def _scores(pca: PCA, pixels: np.ndarray) -> np.ndarray:
 def splits(frames: Frames, rows: np.ndarray) -> list[Split]:
     """Split `rows` into the training data and the rest, or into folds that share no variation.
 
-    Raises:
-        ValueError: There are too few variations to fit, choose the penalty and test on different ones.
+    Returns:
+        Rows to fit to and to test on; none, with a warning, where there are too few variations to fit, choose the
+        penalty and test on different ones.
     """
-    variations = frames.variations[rows]
-    n = len(np.unique(variations if frames.to_fit is None else variations[frames.to_fit[rows]]))
-    needed = 3 if frames.to_fit is None else 2
+    of_rows = frames.variations[rows]
+    to_fit = np.ones(len(rows), bool) if frames.to_fit is None else frames.to_fit[rows]
+    n, needed = len(np.unique(of_rows[to_fit])), 3 if frames.to_fit is None else 2
     if n < needed:
-        raise ValueError(
-            f"Probes of '{frames.tasks[rows[0]]}' need {needed} episodes of different variations to fit, and there are "
-            f"{n}. Use a dataset with more, or raise --episodes_per_task."
+        logger.warning(
+            "No probes of '%s': they need %d episodes of different variations to fit, and there are %d. Use a dataset "
+            "with more, or raise --episodes_per_task.",
+            frames.tasks[rows[0]],
+            needed,
+            n,
         )
+        return []
     if frames.to_fit is not None:
-        fit = frames.to_fit[rows]
-        return [(rows[fit], rows[~fit])]
-    folds = GroupKFold(min(FOLDS, n)).split(rows, groups=variations)
+        return [(rows[to_fit], rows[~to_fit])]
+    folds = GroupKFold(min(FOLDS, n)).split(rows, groups=of_rows)
     return [(rows[fit], rows[test]) for fit, test in folds]
 
 
@@ -196,12 +200,8 @@ def probe_positions(frames: Frames) -> list[dict]:
     targets = frames.targets if in_cm else _standardised(frames.targets)
     for task in tqdm(dict.fromkeys(frames.tasks.tolist()), desc="Probing", unit="task"):
         of_task = np.flatnonzero(frames.tasks == task)
-        try:
-            divided = splits(frames, of_task)
-        except ValueError as reason:
-            logger.warning("No probes: %s", reason)
-            continue
-        for target, truth in targets.items():
+        divided = splits(frames, of_task)
+        for target, truth in targets.items() if divided else ():
             factor = _CM if in_cm else truth.shape[1] ** -0.5
             for name in REPRESENTATIONS:
                 x = frames.features[name]
@@ -244,15 +244,11 @@ def probe_task(frames: Frames) -> list[dict]:
 
     Also empty where there are too few variations.
     """
-    if len(set(frames.tasks)) == 1:
+    if len(set(frames.tasks if frames.to_fit is None else frames.tasks[frames.to_fit])) == 1:
         return []
     rows = []
-    try:
-        divided = splits(frames, np.arange(len(frames.tasks)))
-    except ValueError as reason:
-        logger.warning("No probe of the task: %s", reason)
-        return []
-    for name in REPRESENTATIONS:
+    divided = splits(frames, np.arange(len(frames.tasks)))
+    for name in REPRESENTATIONS if divided else ():
         x = frames.features[name]
         correct = []
         for fit, test in divided:

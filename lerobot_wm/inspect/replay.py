@@ -27,7 +27,7 @@ from tqdm import tqdm
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.files import write_whole
-from lerobot_wm.inspect.episodes import CheckpointConfig
+from lerobot_wm.inspect.episodes import CheckpointConfig, check_episodes
 from lerobot_wm.inspect.pictures import PNG, figure_bytes
 from lerobot_wm.policies.common.checkpoint import checkpoint_file, open_checkpoint, read_json, split_revision
 from lerobot_wm.policies.common.checks import check_reads
@@ -173,11 +173,7 @@ def replay(cfg: ReplayConfig) -> Replay:
         trained = trained_episodes(cfg.policy.path, meta)
     held_out = set(range(meta.total_episodes)) - trained
     episodes = sorted(held_out or trained) if cfg.episodes is None else sorted(set(cfg.episodes))
-    if not episodes or not set(episodes) <= set(range(meta.total_episodes)):
-        raise ValueError(
-            f"--episodes={cfg.episodes}: {meta.repo_id} has {meta.total_episodes} episodes. Give some of 0 to "
-            f"{meta.total_episodes - 1}."
-        )
+    check_episodes(meta, episodes)
     keys = {key for policy in policies for key in policy.keys}
     missing = sorted(keys - meta.features.keys())
     if missing:

@@ -1,6 +1,7 @@
 """What the page shows of models: dreams of some episodes, and what `lerobot-wm quality` and `replay` measured."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +25,7 @@ from lerobot_wm.inspect.quality_figures import (
 )
 from lerobot_wm.inspect.replay import replay_table
 from lerobot_wm.policies.latent.policy import LatentPolicy
-from lerobot_wm.tables import Measurement, ReportTable
+from lerobot_wm.tables import Cell, Measurement, ReportTable
 
 # One for each of the first tasks.
 MAX_DREAMS = 3
@@ -157,32 +158,41 @@ def read_quality(path: Path) -> dict[str, Any]:
     }
 
 
+def _table(
+    title: str,
+    corner: str,
+    rows: pd.DataFrame,
+    columns: list[str],
+    cell: Callable[[dict], Cell],
+    n_totals: int = 1,
+) -> ReportTable:
+    """A table with a row for each value of the column `corner`, and a cell for each line of it."""
+    groups = rows.groupby(corner, sort=False)
+    cells = [(str(label), [cell(line) for line in group.to_dict("records")]) for label, group in groups]
+    return ReportTable(title, corner, columns, cells, n_totals=n_totals)
+
+
 def _open_loop_table(table: pd.DataFrame) -> ReportTable:
     """Predictions down, horizons across, over all tasks."""
     overall = table[table["task"] == table["task"].iloc[-1]]
-    rows = [
-        (
-            str(prediction),
-            [
-                Measurement(_number(row.foreground_psnr, 1) or "–", f"{row.psnr:.1f} · {row.ssim:.2f}")
-                for row in group.itertuples()
-            ],
-        )
-        for prediction, group in overall.groupby("prediction", sort=False)
-    ]
-    columns = [f"+{horizon}" for horizon in overall["horizon"].unique()]
-    return ReportTable("Open loop", "prediction", columns, rows)
+    return _table(
+        "Open loop",
+        "prediction",
+        overall,
+        [f"+{horizon}" for horizon in overall["horizon"].unique()],
+        lambda row: Measurement(
+            _number(row["foreground_psnr"], 1) or "–", f"{row['psnr']:.1f} · {row['ssim']:.2f}"
+        ),
+        n_totals=0,
+    )
 
 
 def _foreground_table(table: pd.DataFrame) -> ReportTable:
     """Tasks down, predictions across: foreground PSNR at EXAMPLE_HORIZON."""
     chosen = table[table["horizon"] == EXAMPLE_HORIZON]
-    rows = [
-        (str(task), [_number(value, 1) for value in group["foreground_psnr"]])
-        for task, group in chosen.groupby("task", sort=False)
-    ]
     title = f"Foreground PSNR {EXAMPLE_HORIZON} steps ahead"
-    return ReportTable(title, "task", list(chosen["prediction"].unique()), rows, n_totals=1)
+    columns = list(chosen["prediction"].unique())
+    return _table(title, "task", chosen, columns, lambda row: _number(row["foreground_psnr"], 1))
 
 
 def _reward_table(tasks: list[dict[str, Any]]) -> ReportTable:
@@ -202,43 +212,37 @@ def _reward_table(tasks: list[dict[str, Any]]) -> ReportTable:
 
 def _probe_tables(table: pd.DataFrame) -> list[ReportTable]:
     """One table per target: tasks down, representations across."""
-    tables = []
     error, _ = probe_error(table)
     digits = 1 if error == "cm" else 2
-    for target, group in table.groupby("target", sort=False):
-        rows = [
-            (
-                str(task),
-                [
-                    Measurement(
-                        f"{row[f'median_{error}']:.{digits}f}",
-                        f"{row[f'mean_{error}']:.{digits}f} · {row['r2']:.2f}",
-                    )
-                    for row in of_task.to_dict("records")
-                ],
-            )
-            for task, of_task in group.groupby("task", sort=False)
-        ]
-        columns = list(group["representation"].unique())
-        title = f"Position of the {target}" if error == "cm" else str(target)
-        tables.append(ReportTable(title, "task", columns, rows, n_totals=1))
-    return tables
+
+    def cell(row: dict[str, Any]) -> Measurement:
+        median, mean = row[f"median_{error}"], row[f"mean_{error}"]
+        return Measurement(f"{median:.{digits}f}", f"{mean:.{digits}f} · {row['r2']:.2f}")
+
+    return [
+        _table(
+            f"Position of the {target}" if error == "cm" else str(target),
+            "task",
+            group,
+            list(group["representation"].unique()),
+            cell,
+        )
+        for target, group in table.groupby("target", sort=False)
+    ]
 
 
 def _kl_table(tasks: list[dict[str, Any]]) -> ReportTable:
-    names = list(tasks[0]["percentiles"])
     rows = [
         (
             task["task"],
             [
                 f"{100 * task['share_under_free_nats']:.0f}%",
-                f"{task['mean']:.1f}",
-                *(f"{task['percentiles'][name]:.1f}" for name in names),
+                *(f"{value:.1f}" for value in (task["mean"], *task["percentiles"].values())),
             ],
         )
         for task in tasks
     ]
-    columns = ["below free nats", "mean", *(f"percentile {name}" for name in names)]
+    columns = ["below free nats", "mean", *(f"percentile {name}" for name in tasks[0]["percentiles"])]
     return ReportTable("KL", "task", columns, rows, n_totals=1)
 
 

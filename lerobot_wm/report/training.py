@@ -20,7 +20,7 @@ from lerobot_wm.data.cache import frame_shape
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import episodes_by_task
-from lerobot_wm.inspect.pictures import WEBP, data_uri, log_scale, shorten
+from lerobot_wm.inspect.pictures import WEBP, data_uri, log_scale, shorten, tidy
 from lerobot_wm.policies.common.iql import reward_columns
 
 # Of the first frames shown, in pixels.
@@ -220,10 +220,8 @@ def _figure(name: str, runs: dict[str, Curves]) -> Figure:
     # Otherwise a loss's first steps would hide the rest.
     if lowest > 0 and highest > 10 * lowest:
         log_scale(axes)
-    axes.set_title(name, fontsize=10)
     axes.set_xlabel("step", fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.grid(alpha=0.3)
+    tidy(axes, name)
     if len(runs) > 1:
         figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS, fontsize=7, frameon=False)
     return figure

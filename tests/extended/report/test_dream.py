@@ -349,8 +349,8 @@ def test_a_horizon_ends_the_dream(
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ("--episode=3", r"--episode=3.*test/dream.* 3 .*0 to 2"),
-        ("--episode=-1", r"--episode=-1"),
+        ("--episode=3", r"test/dream.* 3 .*\[3\].*0 to 2"),
+        ("--episode=-1", r"\[-1\].*0 to 2"),
         ("--episode=2", r"--context=5.*episode 2 has 3 frames"),
         ("--episode=0 --horizon=5", r"--context=5, --horizon=5.*episode 0 has 9 frames"),
         ("--episode=0 --horizon=0", r"--horizon=0"),

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_wm.constants import ACTION, OBS_IMAGE
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect import quality
 from lerobot_wm.inspect.episodes import load_world_model
@@ -151,44 +152,34 @@ def reach_root(tmp_path_factory: pytest.TempPathFactory, lerobot_wm_command: Cal
     return root
 
 
-def test_tasks_of_the_training_data_alone_are_left_out(
+def test_only_tasks_of_both_datasets_are_probed(
     demos_root: Path,
     reach_root: Path,
     world_model_path: Path,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with caplog.at_level(logging.WARNING):
-        quality.quality(
-            quality.QualityConfig(
-                str(world_model_path),
-                SourceConfig("test/reach", str(reach_root)),
-                tmp_path,
-                SourceConfig("test/demos", str(demos_root)),
-            )
-        )
-    assert "Push and close a window" in caplog.text
-    result = json.loads((tmp_path / "quality.json").read_text())
-    assert {row["task"] for row in result["probes"]} == {"Reach a goal position", "mean of tasks"}
-    assert result["task_probe"] == []
+    reach, demos = SourceConfig("test/reach", str(reach_root)), SourceConfig("test/demos", str(demos_root))
+    for judged, trained in ((reach, demos), (demos, reach)):
+        with caplog.at_level(logging.WARNING):
+            quality.quality(quality.QualityConfig(str(world_model_path), judged, tmp_path, trained))
+        result = json.loads((tmp_path / "quality.json").read_text())
+        assert {row["task"] for row in result["probes"]} == {"Reach a goal position", "mean of tasks"}
+    assert "No probes of 'Push and close a window'" in caplog.text
 
 
-def test_tasks_without_training_data_are_refused(
-    demos_root: Path,
-    reach_root: Path,
-    world_model_path: Path,
-    tmp_path: Path,
+def test_training_data_of_other_tasks_is_refused(
+    reach_root: Path, world_model_path: Path, tmp_path: Path
 ) -> None:
-    message = r"test/reach.*Push and close a window.*Reach a goal position.*--train_dataset"
-    with pytest.raises(ValueError, match=message):
-        quality.quality(
-            quality.QualityConfig(
-                str(world_model_path),
-                SourceConfig("test/demos", str(demos_root)),
-                tmp_path / "out",
-                SourceConfig("test/reach", str(reach_root)),
-            )
-        )
+    dataset = record(tmp_path / "data", {OBS_IMAGE: camera(64, 64), ACTION: vector(4)}, [("Wave", WINDOW)])
+    config = quality.QualityConfig(
+        str(world_model_path),
+        SourceConfig("test/reach", str(reach_root)),
+        tmp_path / "out",
+        SourceConfig("test/recorded", str(dataset.root)),
+    )
+    with pytest.raises(ValueError, match=r"test/recorded.*Reach a goal position.*--train_dataset"):
+        quality.quality(config)
     assert not (tmp_path / "out").exists()
 
 

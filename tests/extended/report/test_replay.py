@@ -116,5 +116,5 @@ def test_a_world_model_and_an_unknown_episode_are_refused(
     source = SourceConfig("test/demos", str(demos_root))
     with pytest.raises(ValueError, match=r"wm_rssm.*chooses no actions"):
         replay(ReplayConfig(CheckpointConfig(str(world_model_path)), source))
-    with pytest.raises(ValueError, match=r"episodes=\[8\].*0 to 7"):
+    with pytest.raises(ValueError, match=r"test/demos.* 8 .*\[8\].*0 to 7"):
         replay(ReplayConfig(CheckpointConfig(str(policy_paths["wm_bc"])), source, episodes=[8]))
