@@ -9,6 +9,8 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from tqdm import tqdm
 from lerobot_wm.constants import ACTION, OBS_STATE, TASK
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.files import write_whole
-from lerobot_wm.inspect.episodes import CheckpointConfig, check_episodes
+from lerobot_wm.inspect.episodes import CheckpointConfig, check_episodes, episodes_by_task
 from lerobot_wm.inspect.pictures import PNG, figure_bytes
 from lerobot_wm.policies.common.checkpoint import checkpoint_file, open_checkpoint, read_json, split_revision
 from lerobot_wm.policies.common.checks import check_reads
@@ -180,19 +182,19 @@ def replay(cfg: ReplayConfig) -> Replay:
         raise ValueError(
             f"{meta.repo_id} has no {', '.join(missing)}, which a policy reads; it has {list(meta.features)}."
         )
-    has_state = tuple(meta.features.get(OBS_STATE, {"shape": ()})["shape"]) == tuple(
-        meta.features[ACTION]["shape"]
-    )
+    shapes = {key: tuple(feature["shape"]) for key, feature in meta.features.items()}
+    has_state = shapes.get(OBS_STATE) == shapes[ACTION]
     keys |= {ACTION, OBS_STATE} if has_state else {ACTION}
     recorded: dict[int, np.ndarray] = {}
     actions: dict[str, dict[int, np.ndarray]] = {}
-    for episode, frames in _frames(meta, cfg.dataset, episodes, sorted(keys)):
+    stream = _frames(meta, cfg.dataset, episodes, sorted(keys))
+    for episode, frames in groupby(stream, key=itemgetter(0)):
         chosen: dict[str, list[Tensor]] = {}
         for policy in policies:
             policy.reset()
         last: Tensor | None = None
         truth: list[Tensor] = []
-        for frame in frames:
+        for _, frame in frames:
             for policy in policies:
                 for told, action in policy.actions(frame, last).items():
                     chosen.setdefault(f"{policy.name}, {told}", []).append(action)
@@ -210,8 +212,8 @@ def replay(cfg: ReplayConfig) -> Replay:
 
 def _frames(
     meta: LeRobotDatasetMetadata, source: SourceConfig, episodes: list[int], keys: list[str]
-) -> Iterator[tuple[int, Iterator[dict[str, Any]]]]:
-    """Each episode's frames, in order; a frame has these features and `task`."""
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The frames of episodes, in order, each with its episode's index; a frame has these features and `task`."""
     times = [step / meta.fps for step in range(_FRAMES_AT_ONCE)]
     dataset = LeRobotDataset(
         source.repo_id,
@@ -220,21 +222,15 @@ def _frames(
         episodes=episodes,
         delta_timestamps=dict.fromkeys(keys, times),
     )
-    lengths = [meta.episodes["length"][episode] for episode in episodes]
-    bar = tqdm(total=sum(lengths), desc="Replaying", unit="frame")
-
-    def frames(start: int, length: int, task: str) -> Iterator[dict[str, Any]]:
-        for position in range(0, length, _FRAMES_AT_ONCE):
-            window = dataset[start + position]
-            for step in range(min(_FRAMES_AT_ONCE, length - position)):
-                # LeRobot drops the axis of vectors of one number.
-                yield {key: torch.atleast_1d(window[key][step]) for key in keys} | {TASK: task}
-                bar.update()
-
-    start = 0
-    for episode, length in zip(episodes, lengths, strict=True):
-        yield episode, frames(start, length, meta.episodes["tasks"][episode][0])
-        start += length
+    lengths, tasks = meta.episodes["length"][:], meta.episodes["tasks"][:]
+    indices = [episode for episode in episodes for _ in range(lengths[episode])]
+    steps = [step for episode in episodes for step in range(lengths[episode])]
+    for row, (episode, step) in enumerate(zip(tqdm(indices, "Replaying", unit="frame"), steps, strict=True)):
+        if step % _FRAMES_AT_ONCE == 0:
+            window = dataset[row]
+        # LeRobot drops the axis of vectors of one number.
+        frame = {key: torch.atleast_1d(window[key][step % _FRAMES_AT_ONCE]) for key in keys}
+        yield episode, frame | {TASK: tasks[episode][0]}
 
 
 def trained_episodes(path: str, meta: LeRobotDatasetMetadata) -> set[int]:
@@ -245,13 +241,13 @@ def trained_episodes(path: str, meta: LeRobotDatasetMetadata) -> set[int]:
     folder, revision = split_revision(path)
     file = checkpoint_file(folder, "train_config.json", revision)
     settings = {} if file is None else read_json(file)["dataset"]
-    episodes = settings.get("episodes") or list(range(meta.total_episodes))
+    episodes = set(settings.get("episodes") or range(meta.total_episodes))
     share = settings.get("eval_split") or 0.0
-    by_task: dict[str, list[int]] = {}
-    for episode in sorted(set(episodes) & set(range(meta.total_episodes))):
-        by_task.setdefault(meta.episodes["tasks"][episode][0], []).append(episode)
-    kept = (of_task[: len(of_task) - math.ceil(len(of_task) * share)] for of_task in by_task.values())
-    return {episode for of_task in kept for episode in of_task}
+    trained = set()
+    for of_task in episodes_by_task(meta).values():
+        chosen = [episode for episode in of_task if episode in episodes]
+        trained |= set(chosen[: len(chosen) - math.ceil(len(chosen) * share)])
+    return trained
 
 
 def joint_names(meta: LeRobotDatasetMetadata) -> list[str]:

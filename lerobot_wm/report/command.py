@@ -10,14 +10,14 @@ from rich.console import Console
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import ImaginingPolicy, check_features, load_world_model
 from lerobot_wm.inspect.latent_map import latent_figures, latent_map
-from lerobot_wm.inspect.open_loop import open_loop, psnr_table, strips_figure
+from lerobot_wm.inspect.open_loop import CONTEXT, open_loop, psnr_table, strips_figure
 from lerobot_wm.inspect.pictures import PNG, SVG, data_uri, figure_bytes, figure_uri
 from lerobot_wm.records import COMMAND, find_records, provenance, read_records
 from lerobot_wm.report.models import dream_clips, read_quality, read_replay
-from lerobot_wm.report.page import Page, page_of_records
+from lerobot_wm.report.page import Content, render_page, rollout_sections
 from lerobot_wm.report.rollouts import read_evaluation
 from lerobot_wm.report.training import curve_figures, read_logs, summarise_data
-from lerobot_wm.tables import markdown_table, terminal_tables
+from lerobot_wm.tables import ReportTable, markdown_table, terminal_tables
 
 TERMINAL_WIDTH = 100
 
@@ -71,52 +71,77 @@ def report(cfg: ReportConfig) -> Path:
         policy = load_world_model(cfg.world_model_path)
         check_features(policy, meta)
     evaluations = [read_evaluation(folder) for folder in _paths(cfg.videos)]
-    page = Page(cfg.title)
+    content: Content = {}
+    tables: list[ReportTable] = []
     if cfg.records is not None:
         clips = [clip for evaluation in evaluations for clip in evaluation.clips]
-        page = page_of_records(cfg.title, read_records(find_records(cfg.records)), clips)
-    page.made_by = _group_by_machine([*(evaluation.provenance for evaluation in evaluations), provenance()])
-    page.curves = [figure_uri(figure, SVG) for figure in curve_figures(read_logs(_paths(cfg.train_logs)))]
-    if cfg.quality is not None:
-        page.quality = read_quality(cfg.quality)
+        content = rollout_sections(read_records(find_records(cfg.records)), clips)
+        success = content["success"]
+        tables = [*success["tables"], *filter(None, [success["paper_table"]]), *success["comparison_tables"]]
     if cfg.replay is not None:
-        page.replay = read_replay(cfg.replay)
-    if cfg.dataset is None and list(page.sections) == ["provenance"]:
+        content["replay"] = read_replay(cfg.replay)
+    if cfg.train_logs is not None:
+        figures = curve_figures(read_logs(_paths(cfg.train_logs)))
+        content["training"] = {"curves": [figure_uri(figure, SVG) for figure in figures]}
+    if cfg.quality is not None:
+        content["knowledge"] = {"latents": None, "quality": read_quality(cfg.quality)}
+    if cfg.dataset is None and not content:
         raise ValueError(
             "There is nothing to show: give --records (with or without --videos), --train_logs, --replay, --quality or "
             "--dataset.repo_id."
         )
+    made_by = _group_by_machine([*(evaluation.provenance for evaluation in evaluations), provenance()])
+    content["provenance"] = {"made_by": made_by, "has_rollouts": cfg.records is not None}
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     if cfg.dataset is not None and meta is not None:
-        page.data = summarise_data(meta, cfg.dataset)
+        content["data"] = {"data": summarise_data(meta, cfg.dataset)}
         if policy is not None:
-            _show_world_model(page, policy, meta, cfg.dataset, cfg.output_dir)
+            _show_world_model(content, policy, meta, cfg.dataset, cfg.output_dir)
 
-    success = [*page.tables, *([page.paper_table] if page.paper_table else []), *page.comparison_tables]
-    console = Console(width=TERMINAL_WIDTH)
-    for table in [*success, *([page.replay.table] if page.replay else [])]:
-        console.print(*terminal_tables(table))
-    if success:
-        markdown = "".join(map(markdown_table, [*success, *page.detail_tables]))
+    if tables:
+        markdown = "".join(map(markdown_table, [*tables, *content["success"]["detail_tables"]]))
         (cfg.output_dir / "success.md").write_text(markdown)
+    if cfg.replay is not None:
+        tables.append(content["replay"]["table"])
+    console = Console(width=TERMINAL_WIDTH)
+    for table in tables:
+        console.print(*terminal_tables(table))
     index = cfg.output_dir / "index.html"
-    index.write_text(page.html())
+    index.write_text(render_page(cfg.title, content))
     return index
 
 
 def _show_world_model(
-    page: Page, policy: ImaginingPolicy, meta: LeRobotDatasetMetadata, source: SourceConfig, output_dir: Path
+    content: Content,
+    policy: ImaginingPolicy,
+    meta: LeRobotDatasetMetadata,
+    source: SourceConfig,
+    output_dir: Path,
 ) -> None:
-    """Put on the page what a world model imagines of a dataset and knows of it."""
-    page.dataset = meta.repo_id
+    """Add what a world model imagines of a dataset and knows of it."""
     predictions = open_loop(policy, meta, source)
+    table = strips = None
     if predictions:
         picture = figure_bytes(strips_figure(predictions), PNG)
         (output_dir / "open_loop.png").write_bytes(picture)
-        page.open_loop, page.strips = psnr_table(predictions), data_uri(picture, PNG)
-    page.dreams = dream_clips(policy, meta, source)
-    page.latents = latent_map(policy, meta, source)
-    page.latent_pictures = [figure_uri(figure, PNG) for figure in latent_figures(page.latents)]
+        table, strips = psnr_table(predictions), data_uri(picture, PNG)
+    dreams = dream_clips(policy, meta, source)
+    if dreams or predictions:
+        content["imagination"] = {
+            "dataset": meta.repo_id,
+            "context": CONTEXT,
+            "dreams": dreams,
+            "open_loop": table,
+            "strips": strips,
+        }
+    latents = latent_map(policy, meta, source)
+    content["knowledge"] = {
+        "quality": None,
+        **content.get("knowledge", {}),
+        "dataset": meta.repo_id,
+        "latents": latents,
+        "latent_pictures": [figure_uri(figure, PNG) for figure in latent_figures(latents)],
+    }
 
 
 def _group_by_machine(results: list[dict[str, str]]) -> list[tuple[list[str], dict[str, str]]]:

@@ -35,22 +35,10 @@ MAX_FRAMES = 120
 
 @dataclass(frozen=True)
 class DreamClip:
-    """The dreams of one episode.
+    """The dreams of one episode, their video and their strip, which are data URIs."""
 
-    Attributes:
-        task, episode: Which.
-        n_imagined: Imagined steps.
-        kinds: What is shown beside the truth, in order.
-        psnr, copy_psnr: In dB, under true actions and of repeating the last frame seen.
-        video, strip: Data URIs.
-    """
-
-    task: str
-    episode: int
-    n_imagined: int
-    kinds: list[str]
-    psnr: float
-    copy_psnr: float
+    episode: Episode
+    dreams: Dreams
     video: str
     strip: str
 
@@ -85,12 +73,8 @@ def _clip(dreams: Dreams, episode: Episode, fps: int) -> DreamClip:
         write_dream(path, dreams, fps)
         video = path.read_bytes()
     return DreamClip(
-        task=episode.task,
-        episode=episode.index,
-        n_imagined=dreams.n_imagined,
-        kinds=list(dreams.by_actions),
-        psnr=dreams.psnr(),
-        copy_psnr=dreams.copy_psnr(),
+        episode=episode,
+        dreams=dreams,
         video=data_uri(video, MP4),
         strip=figure_uri(strip_figure(dreams), PNG),
     )
@@ -100,17 +84,8 @@ def _clip(dreams: Dreams, episode: Episode, fps: int) -> DreamClip:
 MAX_REPLAYS = 4
 
 
-@dataclass(frozen=True)
-class ReplaySummary:
-    """What `lerobot-wm replay` found: its table, and for some episodes, by index, a picture as a data URI."""
-
-    table: ReportTable
-    pictures: dict[int, str]
-    n_episodes: int
-
-
-def read_replay(path: Path) -> ReplaySummary:
-    """Read a replay.json and the figures of the first episodes beside it.
+def read_replay(path: Path) -> dict[str, Any]:
+    """What the page's section on replay shows: its table, and the figures of the first episodes as data URIs.
 
     Raises:
         FileNotFoundError: One of them is missing.
@@ -121,7 +96,7 @@ def read_replay(path: Path) -> ReplaySummary:
         episode: data_uri(_read(path.with_name(f"episode_{episode}.png"), "--replay", "replay"), PNG)
         for episode in episodes[:MAX_REPLAYS]
     }
-    return ReplaySummary(replay_table(content), pictures, len(episodes))
+    return {"table": replay_table(content), "pictures": pictures, "n_episodes": len(episodes)}
 
 
 def _read(path: Path, flag: str, command: str) -> bytes:

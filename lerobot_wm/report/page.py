@@ -1,20 +1,17 @@
 """The HTML page: what it shows, and its templates."""
 
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from lerobot_wm.inspect.latent_map import LatentMap
-from lerobot_wm.inspect.open_loop import CONTEXT
 from lerobot_wm.inspect.pictures import SVG, figure_uri, shorten
 from lerobot_wm.records import Estimate, Record, SuccessRate, is_in_split, present_splits, success_rate
 from lerobot_wm.report.arms import ARMS
 from lerobot_wm.report.comparison import group_by_arm
-from lerobot_wm.report.models import DreamClip, ReplaySummary
-from lerobot_wm.report.rollouts import MAX_VIDEO_BYTES, Clip, Grid, make_grids, within_limit
+from lerobot_wm.report.rollouts import MAX_VIDEO_BYTES, Clip, make_grids, within_limit
 from lerobot_wm.report.success import (
     comparison_tables,
     overall_table,
@@ -22,81 +19,40 @@ from lerobot_wm.report.success import (
     seed_table,
     task_table,
 )
-from lerobot_wm.report.training import DataSummary
 from lerobot_wm.tables import Measurement, ReportTable, cell_text
 
 SPLIT_COLOURS = {"seen": "#e08214", "unseen": "#2f6fde"}
 
 
-@dataclass
-class Page:
-    """The content of a report; a section without content is left out.
+# The sections in the page's order, each with its heading; `<name>_section.html.j2` is its template.
+HEADINGS = {
+    "data": "The data",
+    "success": "Success rates",
+    "videos": "Videos, and which variations fail",
+    "replay": "How far the policy is from recorded actions",
+    "imagination": "What the world model imagines",
+    "knowledge": "What the world model knows",
+    "training": "Training curves",
+    "provenance": "How to reproduce this page",
+}
+# What the template of each section shows, by the section's name.
+Content = dict[str, dict[str, Any]]
 
-    Attributes:
+
+def render_page(title: str, content: Content) -> str:
+    """One self-contained page: it loads nothing when it is opened, and its short script only plays videos.
+
+    Args:
         title: The page's title.
-        arms: Each arm of the rollouts, its preset, and what it is.
-        n_rollouts: How many records of rollouts there are.
-        tables, detail_tables, paper_table, comparison_tables: Success rates.
-        grids: Which variations succeed and fail.
-        split_picture: Success on seen and on unseen variations, a data URI.
-        featured: The clips shown first.
-        n_clips: How many videos are on the page, and how many there were.
-        made_by: Commands, each list with the versions and the kind of machine they ran with.
-        data: The dataset that is described.
-        replay: How far policies are from recorded actions.
-        dataset: Repo id of the dataset that the world model is shown.
-        dreams: Dreams of some of its episodes.
-        open_loop, strips: The table of open-loop prediction, and its picture as a data URI.
-        latents, latent_pictures: The map of latents, and its pictures by task and by time as data URIs.
-        quality: The world model's quality, see `read_quality`.
-        curves: Training curves as data URIs, one for each logged quantity.
+        content: The sections; others are left out.
     """
-
-    title: str
-    arms: list[tuple[str, str, str]] = field(default_factory=list)
-    n_rollouts: int = 0
-    tables: list[ReportTable] = field(default_factory=list)
-    detail_tables: list[ReportTable] = field(default_factory=list)
-    paper_table: ReportTable | None = None
-    comparison_tables: list[ReportTable] = field(default_factory=list)
-    grids: list[Grid] = field(default_factory=list)
-    split_picture: str = ""
-    featured: list[Clip] = field(default_factory=list)
-    n_clips: tuple[int, int] = (0, 0)
-    made_by: list[tuple[list[str], dict[str, str]]] = field(default_factory=list)
-    data: DataSummary | None = None
-    replay: ReplaySummary | None = None
-    dataset: str = ""
-    dreams: list[DreamClip] = field(default_factory=list)
-    open_loop: ReportTable | None = None
-    strips: str = ""
-    latents: LatentMap | None = None
-    latent_pictures: list[str] = field(default_factory=list)
-    quality: dict[str, Any] | None = None
-    curves: list[str] = field(default_factory=list)
-
-    @property
-    def sections(self) -> dict[str, str]:
-        """Headings of the sections that have content, by name, in the order of the page."""
-        headings = {
-            "data": "What was trained, and on which data" if self.arms else "The data" if self.data else "",
-            "success": "Success rates" if self.tables else "",
-            "videos": "Videos, and which variations fail" if self.grids else "",
-            "replay": "How far the policy is from recorded actions" if self.replay else "",
-            "imagination": "What the world model imagines" if self.open_loop or self.dreams else "",
-            "knowledge": "What the world model knows" if self.latents or self.quality else "",
-            "training": "Training curves" if self.curves else "",
-            "provenance": "How to reproduce this page",
-        }
-        return {name: heading for name, heading in headings.items() if heading}
-
-    def html(self) -> str:
-        """One self-contained page: it loads nothing when it is opened, and its short script only plays videos."""
-        page = template_environment().get_template("page.html.j2")
-        video_megabytes = MAX_VIDEO_BYTES // 1_000_000
-        return page.render(
-            vars(self), sections=self.sections, context=CONTEXT, video_megabytes=video_megabytes
-        )
+    environment = template_environment()
+    sections = [
+        (name, heading, Markup(environment.get_template(f"{name}_section.html.j2").render(content[name])))
+        for name, heading in HEADINGS.items()
+        if name in content
+    ]
+    return environment.get_template("page.html.j2").render(title=title, sections=sections)
 
 
 def template_environment() -> Environment:
@@ -115,29 +71,33 @@ def template_environment() -> Environment:
     return environment
 
 
-def page_of_records(title: str, records: list[Record], clips: list[Clip]) -> Page:
-    """A page of rollouts: what it shows of their records and videos."""
+def rollout_sections(records: list[Record], clips: list[Clip]) -> Content:
+    """What the page shows of records and of the videos of their rollouts."""
     inlined = within_limit(clips)
     # The first success and the first failure.
     first = {clip.success: clip for clip in reversed(inlined)}
-    page = Page(
-        title=title,
-        arms=[
-            (arm, runs[0]["preset"], ARMS[arm].description if arm in ARMS else "")
-            for arm, runs in group_by_arm(records).items()
-        ],
-        n_rollouts=len(records),
-        tables=[task_table("Success per task", records), overall_table(records)],
-        detail_tables=_detail_tables(records),
-        paper_table=paper_comparison(records),
-        comparison_tables=comparison_tables(records),
-        grids=make_grids(records, inlined),
-        featured=[first[success] for success in (True, False) if success in first],
-        n_clips=(len(inlined), len(clips)),
-    )
-    if len(present_splits(records)) > 1:
-        page.split_picture = figure_uri(split_figure(records), SVG)
-    return page
+    return {
+        "success": {
+            "arms": [
+                (arm, runs[0]["preset"], ARMS[arm].description if arm in ARMS else "")
+                for arm, runs in group_by_arm(records).items()
+            ],
+            "n_rollouts": len(records),
+            "tables": [task_table("Success per task", records), overall_table(records)],
+            "detail_tables": _detail_tables(records),
+            "paper_table": paper_comparison(records),
+            "comparison_tables": comparison_tables(records),
+            "split_picture": figure_uri(split_figure(records), SVG)
+            if len(present_splits(records)) > 1
+            else None,
+        },
+        "videos": {
+            "grids": make_grids(records, inlined),
+            "featured": [first[success] for success in (True, False) if success in first],
+            "n_clips": (len(inlined), len(clips)),
+            "video_megabytes": MAX_VIDEO_BYTES // 1_000_000,
+        },
+    }
 
 
 def _detail_tables(records: list[Record]) -> list[ReportTable]:

@@ -64,7 +64,7 @@ def test_records_alone(
     assert f"{tmp_path}/report/index.html" in printed
 
     page = Page(tmp_path / "report" / "index.html")
-    assert page.anchors == ["data", "success", "videos", "provenance"]
+    assert page.anchors == ["success", "videos", "provenance"]
     assert "R&D <1>" in page.text
     assert re.search(r"100% +50/50\s+\[93, 100\]", page.text)
     assert "[0.61, 1.65]" in page.text, "a table's notes"
@@ -175,7 +175,7 @@ def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, 
         "where it was evaluated"
     )
     assert provenance.count("GPU") == 2, "and where the page was written"
-    assert "The data: test/episodes" in page.text
+    assert "test/episodes" in page.text
     assert "116, 0.0 minutes at 80 frames per second" in page.text
     with Image.open(tmp_path / "report" / "open_loop.png") as picture:
         assert picture.width > 600
@@ -209,7 +209,7 @@ def test_a_dataset_alone_is_described(records_file: Path, tmp_path: Path, episod
     index = report(ReportConfig(records=str(records_file), output_dir=tmp_path / "report", dataset=dataset))
     page = Page(index)
     assert len(page.anchors) == 4
-    assert "The data: test/episodes" in page.text
+    assert "test/episodes" in page.text
     assert not (tmp_path / "report" / "open_loop.png").exists()
 
 

@@ -288,13 +288,15 @@ def test_clips_are_of_tasks_that_the_policy_knows(
 ) -> None:
     meta, source = LeRobotDatasetMetadata("test/dream", root=root), SourceConfig("test/dream", str(root))
     clips = dream_clips(load_world_model(str(checkpoints["wm_bc"])), meta, source)
-    assert [(clip.task, clip.episode, clip.n_imagined) for clip in clips] == [
+    assert [(clip.episode.task, clip.episode.index, clip.dreams.n_imagined) for clip in clips] == [
         ("lift it", 0, LENGTHS[0] - 5),
         ("drop it", 1, LENGTHS[1] - 5),
     ], "the last episode of each task that is longer than what is seen"
-    assert clips[0].kinds == [TRUE_ACTIONS, ZERO_ACTIONS, OWN_ACTIONS]
+    assert list(clips[0].dreams.by_actions) == [TRUE_ACTIONS, ZERO_ACTIONS, OWN_ACTIONS]
     stranger = make_checkpoint(tmp_path, "wm_bc", tasks=["drop it", "iron it"])
-    assert [clip.task for clip in dream_clips(load_world_model(str(stranger)), meta, source)] == ["drop it"]
+    assert [clip.episode.task for clip in dream_clips(load_world_model(str(stranger)), meta, source)] == [
+        "drop it"
+    ]
 
 
 def test_video_frames_show_truth_and_dreams_side_by_side(dreams: Dreams) -> None:
