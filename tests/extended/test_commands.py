@@ -46,6 +46,7 @@ def test_the_commands_work_as_written(
     monkeypatch.chdir(tmp_path)
     for place, target in (
         ("data/mt6", demos_root),
+        ("outputs/bc/checkpoints/last", policy_paths["wm_bc"].parent),
         ("outputs/iql/checkpoints/last", policy_paths["wm_iql"].parent),
     ):
         Path(place).parent.mkdir(parents=True)
@@ -55,6 +56,7 @@ def test_the_commands_work_as_written(
     for made in (
         "wm/checkpoints/000002",
         "dream/episode_3.mp4",
+        "replay/replay.json",
         "eval/records.jsonl",
         "eval_noise/records.jsonl",
         "report/index.html",

@@ -92,7 +92,9 @@ def test_the_page_works_as_written(
     def labels(t: int, length: int) -> dict[str, np.ndarray]:
         return {"next.success": np.array([t == length - 1])}
 
-    dataset = record(tmp_path / "data" / "robot", FEATURES, [("Pick", 8), ("Place", 5)], labels)
+    # The last episode of each task is held out.
+    episodes = [("Pick", 8), ("Place", 5), ("Pick", 7), ("Place", 6)]
+    dataset = record(tmp_path / "data" / "robot", FEATURES, episodes, labels)
     record(tmp_path / "data" / "new_tasks", FEATURES, [("Stack", 7)], labels)
     converted = {"image": camera(48, 48), "state": vector(9), "actions": vector(7)}
     record(tmp_path / "data" / "converted", converted, [("Pick", 6)])
@@ -122,4 +124,9 @@ def test_the_page_works_as_written(
         "--num_workers=0 --dataset.repo_id=user/robot_rewarded --dataset.root=data/robot_rewarded --output_dir=out",
     )
     rewarded = LeRobotDataset("user/robot_rewarded", root="data/robot_rewarded")
-    assert np.flatnonzero(rewarded.hf_dataset.with_format("numpy")["next.reward"][:]).tolist() == [7, 12]
+    assert np.flatnonzero(rewarded.hf_dataset.with_format("numpy")["next.reward"][:]).tolist() == [
+        7,
+        12,
+        19,
+        25,
+    ]
