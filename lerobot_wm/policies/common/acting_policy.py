@@ -1,6 +1,7 @@
 """The base class of the policies that choose actions."""
 
 import logging
+from collections import deque
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from lerobot_wm.constants import ACTION, TASK
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
 from lerobot_wm.policies.common.acting_config import ActingConfig
-from lerobot_wm.policies.common.actions import ActionNoise, RelativeToState, action_range
+from lerobot_wm.policies.common.actions import RelativeToState, RolloutNoise, action_range
 from lerobot_wm.policies.common.config import PolicyConfig
 from lerobot_wm.policies.common.features import Statistics, join_vectors, joined_statistics
 from lerobot_wm.policies.common.policy import BasePolicy
@@ -26,7 +27,7 @@ _WHITE = 1.01  # resizing and floating point may exceed 1 a little; a camera's b
 class ActingPolicy(BasePolicy):
     """Base of the policies that choose actions: tasks as one-hot ids, scaled proprioception and actions, action noise.
 
-    Subclasses also define `observation_networks`, `task_start`, `actor_mean` and `select_action`.
+    Subclasses also define `observe`, `observation_dim`, `observation_networks`, `task_start` and `actor_chunk`.
     """
 
     config: ActingConfig
@@ -36,15 +37,16 @@ class ActingPolicy(BasePolicy):
         self.state_scaling = Affine(self.config.state_dim)
         self.action_scaling = Affine(self.config.action_dim)
         self.relative_to_state = RelativeToState(self.config)
-        self._action_noise = ActionNoise(self.config.action_noise)
+        self._noise = RolloutNoise()
+        self._actions: deque[Tensor] = deque()  # predicted and not executed yet, (B, A) each
 
     def fit_dataset(self, stats: Statistics, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Scale proprioception to unit variance and actions to [-1, 1]."""
         self.state_scaling.set_standard(*joined_statistics(stats, self.config.state_vectors, "mean", "std"))
-        self.action_scaling.set_range(*action_range(self.config, stats, dataset_meta))
+        self.action_scaling.set_range(*action_range(self.config, stats, dataset_meta, self.chunk_size))
 
     def scaled(self, action: Tensor, state: Tensor) -> Tensor:
-        """Actions (B, A) as the heads learn them, given proprioception (B, P) at the same frames."""
+        """Actions (B, A), or chunks of them (B, K, A), as the heads learn them, given proprioception (B, P)."""
         return self.action_scaling(self.relative_to_state(action, state))
 
     def unscaled(self, scaled: Tensor, state: Tensor) -> Tensor:
@@ -71,7 +73,7 @@ class ActingPolicy(BasePolicy):
         return next(len(batch[key]) for key in keys if isinstance(batch.get(key), Tensor))
 
     def scaled_actions(self, batch: dict[str, Any]) -> Tensor:
-        """A training batch's actions (B, A) as the heads learn them."""
+        """A training batch's actions (B, A), or chunks (B, K, A), as the heads learn them."""
         has_windows = self.config.observation_delta_indices is not None  # frames t and t+1
         return self.scaled(batch[ACTION], self.state_at(batch, 0 if has_windows else None))
 
@@ -85,7 +87,9 @@ class ActingPolicy(BasePolicy):
 
     def warn_if_actions_out_of_range(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Warn of actions in a dataset that this policy, scaled as in its first training, cannot command."""
-        low, high = action_range(self.config, dataset_meta.stats or {}, dataset_meta)  # (A,), on the CPU
+        low, high = action_range(
+            self.config, dataset_meta.stats or {}, dataset_meta, self.chunk_size
+        )  # (A,), on the CPU
         ends = (torch.full_like(self.action_scaling.offset, end) for end in (-1.0, 1.0))
         lowest, highest = (self.action_scaling.inverse(end).cpu() for end in ends)  # (A,)
         tolerance = _RANGE_TOLERANCE * (high - low)
@@ -99,6 +103,11 @@ class ActingPolicy(BasePolicy):
 
     def observation_networks(self) -> list[MLP]:
         """The networks that read the observation (B, O), and perhaps more after it."""
+        raise NotImplementedError
+
+    @property
+    def observation_dim(self) -> int:
+        """O, the size of what the heads read."""
         raise NotImplementedError
 
     @property
@@ -121,16 +130,34 @@ class ActingPolicy(BasePolicy):
         logger.info("New tasks: %s; known ones: %s", new, self.config.tasks)
         self.config.tasks = [*self.config.tasks, *new]
 
-    def actor_mean(self, observation: Tensor) -> Tensor:
-        """The policy's action (B, A), scaled to [-1, 1], for observations (B, O)."""
+    @property
+    def chunk_size(self) -> int:
+        """K, how many actions are predicted at once."""
+        return 1
+
+    @property
+    def n_action_steps(self) -> int:
+        """How many of them are executed before the next prediction."""
+        return 1
+
+    def observe(self, batch: dict[str, Any], state: Tensor) -> Tensor:
+        """What the heads read, (B, O), of the next frame: a batch of `select_action` and its proprioception (B, P)."""
         raise NotImplementedError
 
-    def reset(self) -> None:
-        """Forget the episode; LeRobot calls this between episodes."""
-        self._action_noise.reset()
+    def actor_chunk(self, observation: Tensor, batch: dict[str, Any] | None = None) -> Tensor:
+        """The policy's next actions (B, K, A), scaled to [-1, 1], for observations (B, O).
+
+        A policy that samples them draws from the stream of each rollout in the batch of `select_action`, or without a
+        batch takes the middle of its noise.
+        """
+        raise NotImplementedError
+
+    def actor_mean(self, observation: Tensor) -> Tensor:
+        """The policy's next action (B, A), scaled to [-1, 1], for observations (B, O)."""
+        return self.actor_chunk(observation)[:, 0]
 
     def act(self, observation: Tensor, state: Tensor) -> Tensor:
-        """The policy's mean action, clipped to the dataset's range, in its units.
+        """The policy's next action, clipped to the dataset's range, in its units.
 
         Args:
             observation: What the heads read, (B, O).
@@ -141,12 +168,75 @@ class ActingPolicy(BasePolicy):
         """
         return self.unscaled(self.actor_mean(observation).clamp(-1, 1), state)
 
+    def reset(self) -> None:
+        """Forget the episode; LeRobot calls this between episodes."""
+        self._noise.reset()
+        self.drop_queued_actions()
+
+    def drop_queued_actions(self) -> None:
+        """Forget the actions that were predicted and not executed, as LeRobot asks where a person took over."""
+        self._actions.clear()
+
+    def executed(self, action: Tensor) -> None:
+        """Tell the policy which action was executed last, where it is not the one that `select_action` returned.
+
+        Args:
+            action: a_{t-1}, (B, A) in the dataset's units.
+        """
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """Read the next frame and act: the next of the predicted actions, clipped, and `action_noise`.
+
+        Args:
+            batch: Each camera (B, C, H, W) in [0, 1], proprioception such as `observation.state` (B, P), `task` (B
+                strings), and `observation.environment_state` (B, F) with `use_environment_state`.
+            **kwargs: Not used; LeRobot passes options of other policies.
+
+        Returns:
+            Actions in the dataset's units, (B, A).
+
+        Raises:
+            ValueError: A camera or a state is missing or has another size than in training, or the task is unknown.
+        """
+        observation, state = self._observe(batch)
+        if not self._actions or len(self._actions[0]) != len(observation):
+            self._actions = deque(self._chunk(observation, state, batch)[:, : self.n_action_steps].unbind(1))
+        action = self.with_noise(self._actions.popleft(), batch)
+        self.executed(action)
+        return action
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """Read the next frame and predict all its actions, (B, K, A) in the dataset's units.
+
+        The arguments and errors are those of `select_action`, whose queue of actions it leaves alone.
+        """
+        observation, state = self._observe(batch)
+        chunk = torch.stack(
+            [self.with_noise(action, batch) for action in self._chunk(observation, state, batch).unbind(1)],
+            dim=1,
+        )
+        self.executed(chunk[:, 0])
+        return chunk
+
+    def _observe(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        if self.training:  # no dropout and no random shifts, as LeRobot's policies act
+            self.eval()
+        check_observation(self.config, batch)
+        state = self.state_at(batch)
+        return self.observe(batch, state), state
+
+    def _chunk(self, observation: Tensor, state: Tensor, batch: dict[str, Any]) -> Tensor:
+        return self.unscaled(self.actor_chunk(observation, batch).clamp(-1, 1), state)
+
     def with_noise(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
         """Actions (B, A) with `action_noise`, clipped to the dataset's range; `batch` is that of `select_action`."""
         if self.config.action_noise == 0:
             return action
         state = self.state_at(batch)
-        noisy = self._action_noise(self.scaled(action, state), batch)  # (B, A)
+        scaled = self.scaled(action, state)  # (B, A)
+        noisy = scaled + self.config.action_noise * self._noise(scaled, batch)
         return self.unscaled(noisy.clamp(-1, 1), state)
 
     def one_hot_tasks(self, batch: dict[str, Any], batch_size: int) -> Tensor:
@@ -171,10 +261,6 @@ class ActingPolicy(BasePolicy):
         index = {task: i for i, task in enumerate(self.config.tasks)}
         ids = torch.tensor([index[name] for name in names], device=self.state_scaling.offset.device)
         return nn.functional.one_hot(ids, len(self.config.tasks)).float()
-
-    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """`select_action` as a chunk of one: (B, 1, A)."""
-        return self.select_action(batch, **kwargs)[:, None]
 
 
 def check_observation(config: PolicyConfig, batch: dict[str, Any]) -> None:

@@ -30,7 +30,7 @@ class RelativeToState(nn.Module):
         )
 
     def forward(self, action: Tensor, state: Tensor) -> Tensor:
-        """Actions (B, A) relative to proprioception (B, P) at the same frames."""
+        """Actions (B, A), or chunks (B, K, A), relative to proprioception (B, P) at the (first) frame."""
         return self._add(action, state, -1)
 
     def inverse(self, action: Tensor, state: Tensor) -> Tensor:
@@ -40,13 +40,16 @@ class RelativeToState(nn.Module):
     def _add(self, action: Tensor, state: Tensor, sign: int) -> Tensor:
         if not len(self.of_action):
             return action
-        return action.index_add(-1, self.of_action, state[..., self.of_state].to(action.dtype), alpha=sign)
+        measured = state[..., self.of_state].to(action.dtype)  # (B, R)
+        if action.ndim > state.ndim:
+            measured = measured.unsqueeze(-2).expand(*action.shape[:-1], -1)  # (B, K, R)
+        return action.index_add(-1, self.of_action, measured, alpha=sign)
 
 
 def action_range(
-    config: ActingConfig, stats: Statistics, dataset_meta: LeRobotDatasetMetadata
+    config: ActingConfig, stats: Statistics, dataset_meta: LeRobotDatasetMetadata, chunk_size: int
 ) -> tuple[Tensor, Tensor]:
-    """Lowest and highest actions (A,) of a dataset, as the heads learn them."""
+    """Lowest and highest actions (A,) of a dataset, as the heads learn them in chunks of this size."""
     low, high = (value.clone() for value in statistics(stats, ACTION, "min", "max"))  # (A,)
     chosen = config.relative_indices
     if chosen:
@@ -54,34 +57,39 @@ def action_range(
             frame_values(dataset_meta, key).view(-1, config.action_dim)
             for key in (ACTION, recorded_name(OBS_STATE))
         )  # (N, A)
-        relative = action[:, chosen] - state[:, chosen]  # (N, R)
-        low[chosen], high[chosen] = relative.amin(0), relative.amax(0)
+        action, state = action[:, chosen], state[:, chosen]  # (N, R)
+        episode = frame_values(dataset_meta, "episode_index")  # (N,)
+        for k in range(chunk_size):  # a_{t+k} - s_t within episodes
+            together = episode[k:] == episode[: len(episode) - k]
+            relative = (action[k:] - state[: len(state) - k])[together]
+            if k == 0:
+                low[chosen], high[chosen] = relative.amin(0), relative.amax(0)
+            elif len(relative):
+                low[chosen] = low[chosen].minimum(relative.amin(0))
+                high[chosen] = high[chosen].maximum(relative.amax(0))
     return low, high
 
 
-class ActionNoise:
-    """Gaussian noise on actions, one stream per rollout of a batch, seeded by the rollout's first observation.
+class RolloutNoise:
+    """Gaussian noise, one stream per rollout of a batch, seeded by the rollout's first observation.
 
     A rollout is therefore repeatable: it does not depend on the other rollouts, their order, or global random numbers.
-
-    Args:
-        std: Standard deviation, in the units in which the dataset's actions span [-1, 1].
     """
 
-    def __init__(self, std: float) -> None:
-        self.std = std
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
         """Forget the streams: the next call begins new rollouts."""
         self._streams: list[torch.Generator] = []
 
-    def __call__(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
-        """Add the next step's noise to scaled actions (B, A), given the batch of `select_action`."""
-        if len(self._streams) != action.shape[0]:
-            self._streams = [torch.Generator().manual_seed(_digest(batch, i)) for i in range(action.shape[0])]
-        noise = torch.stack([torch.randn(action.shape[1], generator=stream) for stream in self._streams])
-        return action + self.std * noise.to(action)
+    def __call__(self, like: Tensor, batch: dict[str, Any]) -> Tensor:
+        """The next noise of each rollout, of the shape (B, N) of a tensor, given the batch of `select_action`."""
+        if len(self._streams) != like.shape[0]:
+            self._streams = [torch.Generator().manual_seed(_digest(batch, i)) for i in range(like.shape[0])]
+        return torch.stack([torch.randn(like.shape[1], generator=stream) for stream in self._streams]).to(
+            like
+        )
 
 
 def _digest(batch: dict[str, Any], i: int) -> int:

@@ -7,12 +7,12 @@ from torch import Tensor
 
 from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder
 from lerobot_wm.nn.images import camera_images, random_crop
-from lerobot_wm.policies.common.acting_policy import ActingPolicy, check_observation
+from lerobot_wm.policies.common.acting_policy import ActingPolicy
 from lerobot_wm.policies.e2e.config import E2EConfig
 
 
 class E2EPolicy(ActingPolicy):
-    """Base of `e2e_bc` and `e2e_iql`, which make heads in `build` and define `actor_mean` and `compute_loss`."""
+    """Base of `e2e_bc` and `e2e_iql`, which make heads in `build` and define `actor_chunk` and `compute_loss`."""
 
     config: E2EConfig
 
@@ -51,24 +51,6 @@ class E2EPolicy(ActingPolicy):
             images = random_crop(images, self.config.random_crop_pad)
         return torch.cat([self.encoder(images), tasks, self.state_scaling(state)], dim=-1)
 
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """Act on the current image: the policy's mean action, clipped, and `action_noise`.
-
-        Args:
-            batch: Each camera (B, C, H, W) in [0, 1], proprioception such as `observation.state` (B, P), `task` (B
-                strings).
-            **kwargs: Not used; LeRobot passes options of other policies.
-
-        Returns:
-            Actions in the dataset's units, (B, A).
-
-        Raises:
-            ValueError: A camera or the state is missing or has another size than in training, or the task is unknown.
-        """
-        if self.training:  # no dropout and no random shifts, as LeRobot's policies act
-            self.eval()
-        check_observation(self.config, batch)
-        state = self.state_at(batch)
-        tasks = self.one_hot_tasks(batch, state.shape[0])
-        return self.with_noise(self.act(self.observation(self.images(batch), state, tasks), state), batch)
+    def observe(self, batch: dict[str, Any], state: Tensor) -> Tensor:
+        """Encode the new image; join its features, the one-hot task and proprioception: (B, O)."""
+        return self.observation(self.images(batch), state, self.one_hot_tasks(batch, len(state)))

@@ -14,7 +14,7 @@ from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
 from lerobot_wm.data.latents import weights_fingerprint
 from lerobot_wm.nn.images import camera_images, side_by_side
 from lerobot_wm.nn.normalize import Affine
-from lerobot_wm.policies.common.acting_policy import ActingPolicy, check_observation
+from lerobot_wm.policies.common.acting_policy import ActingPolicy
 from lerobot_wm.policies.common.checkpoint import read_config, split_revision
 from lerobot_wm.policies.common.features import Statistics, join_vectors, statistics
 from lerobot_wm.policies.latent.config import LatentPolicyConfig, open_world_model
@@ -26,7 +26,7 @@ from lerobot_wm.world_model.interface import LatentModel, LatentState
 class LatentPolicy(ActingPolicy):
     """Base of `wm_bc` and `wm_iql`: holds the frozen world model, or an encoder in its place, and the filter's state.
 
-    Subclasses make the heads in `build`, and define `actor_mean` and `compute_loss`.
+    Subclasses make the heads in `build`, and define `actor_chunk` and `compute_loss`.
     """
 
     config: LatentPolicyConfig
@@ -68,6 +68,11 @@ class LatentPolicy(ActingPolicy):
         super().continue_training(dataset_meta)
         if self.config.use_latent:
             self.config.check_latents(dataset_meta)
+
+    @property
+    def observation_dim(self) -> int:
+        """O, the size of the heads' input."""
+        return self.config.observation_dim
 
     @property
     def task_start(self) -> int:
@@ -147,38 +152,14 @@ class LatentPolicy(ActingPolicy):
         # With `save_predicted_video`, lerobot-eval collects this after every step and joins it along dim 2.
         self.last_predicted_latents: Tensor | None = None
 
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """Filter the new image and act on the state: the policy's mean action, clipped, and `action_noise`.
-
-        Args:
-            batch: Each camera (B, C, H, W) in [0, 1], proprioception such as `observation.state` (B, P), `task` (B
-                strings), and `observation.environment_state` (B, F) with `use_environment_state`.
-            **kwargs: Not used; LeRobot passes options of other policies.
-
-        Returns:
-            Actions in the dataset's units, (B, A).
-
-        Raises:
-            ValueError: A camera or a state is missing or has another size than in training, or the task is unknown.
-        """
-        if self.training:  # no dropout, as LeRobot's policies act
-            self.eval()
-        check_observation(self.config, batch)
-        state = self.state_at(batch)
+    def observe(self, batch: dict[str, Any], state: Tensor) -> Tensor:
+        """Filter the new image; join s_t, the one-hot task, proprioception and full state: (B, O)."""
         latent = self._filter(batch) if self.config.use_latent else None
         env_state = batch[OBS_ENV_STATE] if self.config.use_environment_state else None
-        tasks = self.one_hot_tasks(batch, state.shape[0])
-        action = self.act(self.observation(state, tasks, latent, env_state), state)
-        self._prev_action = self.with_noise(action, batch)
-        return self._prev_action
+        return self.observation(state, self.one_hot_tasks(batch, len(state)), latent, env_state)
 
     def executed(self, action: Tensor) -> None:
-        """Tell the filter which action was executed last, where it is not the one that `select_action` returned.
-
-        Args:
-            action: a_{t-1}, (B, A) in the dataset's units.
-        """
+        """Tell the filter a_{t-1}, (B, A) in the dataset's units."""
         self._prev_action = action.to(self.action_scaling.offset.device)
 
     def decode_predicted_latents(self, frames: Tensor) -> Tensor:

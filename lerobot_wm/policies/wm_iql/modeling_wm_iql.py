@@ -43,9 +43,9 @@ class WMIQLPolicy(LatentPolicy):
         """The agent's networks."""
         return self.agent.networks()
 
-    def actor_mean(self, observation: Tensor) -> Tensor:
-        """Mean of the policy's Gaussian (B, A) for observations (B, O)."""
-        return self.agent.mean_action(observation, self.config.iql.beta)
+    def actor_chunk(self, observation: Tensor, batch: dict[str, Any] | None = None) -> Tensor:
+        """Mean of the policy's Gaussian (B, 1, A) for observations (B, O)."""
+        return self.agent.mean_action(observation, self.config.iql.beta)[:, None]
 
     def compute_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """Value, critic and actor losses on a batch of transitions.
