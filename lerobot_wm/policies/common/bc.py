@@ -3,12 +3,14 @@
 from dataclasses import dataclass
 from typing import Any
 
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.acting_config import ActingConfig
 from lerobot_wm.policies.common.acting_policy import ActingPolicy
+from lerobot_wm.policies.common.config import compiled
 from lerobot_wm.rl.bc import bc_loss, mean_without_padding
 from lerobot_wm.rl.flow import FlowHead
 
@@ -61,6 +63,11 @@ class BCPolicy(ActingPolicy):
             else MLP(self.observation_dim, config.hidden_dims, size, nn.ReLU, config.dropout)
         )
 
+    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Compile the loss, with `compile_model`."""
+        if self.config.compile_model:
+            self.loss = compiled(self.loss)  # type: ignore[method-assign]
+
     @property
     def chunk_size(self) -> int:
         """K."""
@@ -85,7 +92,7 @@ class BCPolicy(ActingPolicy):
             start = self._noise(start, batch)
         return self.actor(observation, start).unflatten(-1, shape)
 
-    def bc_loss(self, observation: Tensor, batch: dict[str, Any]) -> Tensor:
+    def head_loss(self, observation: Tensor, batch: dict[str, Any]) -> Tensor:
         """The head's scalar loss on observations (B, O), given a training batch.
 
         Args:

@@ -10,7 +10,10 @@ from torch import Tensor, nn
 
 from lerobot_wm.constants import DONE, REWARD, SUCCESS
 from lerobot_wm.data.tables import frame_values
+from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.acting_config import ActingConfig
+from lerobot_wm.policies.common.acting_policy import ActingPolicy
+from lerobot_wm.policies.common.config import compiled
 from lerobot_wm.policies.common.optim import ActorCosineConfig
 from lerobot_wm.rl.agent import IQLAgent
 
@@ -132,20 +135,44 @@ def _numbers(values: list[float]) -> str:
     return ", ".join(f"{value:g}" for value in values)
 
 
-def make_agent(
-    config: IQLConfig, observation_dim: int, action_dim: int, hidden_dims: list[int], dropout: float
-) -> IQLAgent:
-    """The agent that a policy of this configuration trains, on observations (B, observation_dim)."""
-    return IQLAgent(
-        observation_dim,
-        action_dim,
-        betas=config.trained_betas,
-        hidden_dims=hidden_dims,
-        dropout=dropout,
-        expectile=config.expectile,
-        discount=config.discount,
-        target_rate=config.target_rate,
-    )
+class IQLPolicy(ActingPolicy):
+    """Base of `wm_iql` and `e2e_iql`: an agent on [features of the images, one-hot task, proprioception]."""
+
+    config: IQLPolicyConfig
+
+    def build(self) -> None:
+        """Make what the observation needs, and the agent."""
+        super().build()
+        config, iql = self.config, self.config.iql
+        self.agent = IQLAgent(
+            self.observation_dim,
+            config.action_dim,
+            betas=iql.trained_betas,
+            hidden_dims=config.hidden_dims,
+            dropout=config.dropout,
+            expectile=iql.expectile,
+            discount=iql.discount,
+            target_rate=iql.target_rate,
+        )
+        self.rewards_and_ends = RewardsAndEnds(config)
+
+    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Read rewards and ends from the dataset's columns; compile the agent's loss, with `compile_model`."""
+        self.rewards_and_ends = RewardsAndEnds(self.config, dataset_meta)
+        if self.config.compile_model:
+            self.agent.loss = compiled(self.agent.loss)  # type: ignore[method-assign]
+
+    def observation_networks(self) -> list[MLP]:
+        """The agent's networks."""
+        return self.agent.networks()
+
+    def actor_chunk(self, observation: Tensor, batch: dict[str, Any] | None = None) -> Tensor:
+        """Mean of the policy's Gaussian (B, 1, A) for observations (B, O)."""
+        return self.agent.mean_action(observation, self.config.iql.beta)[:, None]
+
+    def update(self) -> None:
+        """Move the target critics; LeRobot calls this after every optimizer step."""
+        self.agent.update_target()
 
 
 def reward_columns(dataset_meta: LeRobotDatasetMetadata) -> list[str]:

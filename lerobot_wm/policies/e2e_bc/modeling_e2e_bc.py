@@ -32,4 +32,4 @@ class E2EBCPolicy(BCPolicy, E2EPolicy):
         """
         state = self.state_at(batch)
         tasks = self.one_hot_tasks(batch, state.shape[0])  # (B, N)
-        return self.bc_loss(self.observation(self.images(batch), state, tasks), batch), {}
+        return self.head_loss(self.observation(self.images(batch), state, tasks), batch), {}

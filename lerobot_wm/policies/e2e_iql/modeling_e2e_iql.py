@@ -3,16 +3,14 @@
 from typing import Any
 
 import torch
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
-from lerobot_wm.nn.mlp import MLP
-from lerobot_wm.policies.common.iql import RewardsAndEnds, make_agent
+from lerobot_wm.policies.common.iql import IQLPolicy
 from lerobot_wm.policies.e2e.policy import E2EPolicy
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
 
 
-class E2EIQLPolicy(E2EPolicy):
+class E2EIQLPolicy(IQLPolicy, E2EPolicy):
     """An IQL agent on [image features, one-hot task, proprioception].
 
     One image encoder serves actor, critics and value, and is trained by their three losses. V(s') and the target
@@ -21,33 +19,12 @@ class E2EIQLPolicy(E2EPolicy):
 
     config_class = E2EIQLConfig
     name = "e2e_iql"
-    config: E2EIQLConfig
-
-    def build(self) -> None:
-        """Make the encoder and the agent."""
-        super().build()
-        config = self.config
-        self.agent = make_agent(
-            config.iql, self.observation_dim, config.action_dim, config.hidden_dims, config.dropout
-        )
-        self.rewards_and_ends = RewardsAndEnds(config)
-
-    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
-        """Read rewards and ends from the dataset's columns."""
-        self.rewards_and_ends = RewardsAndEnds(self.config, dataset_meta)
+    config: E2EIQLConfig  # type: ignore[assignment]
 
     def get_optim_params(self) -> dict:
         """The agent's three groups, the actors first, and the encoder's, at a constant rate."""
         encoder = {"params": list(self.encoder.parameters())}
         return [*self.agent.param_groups(), encoder]  # type: ignore[return-value]
-
-    def observation_networks(self) -> list[MLP]:
-        """The agent's networks."""
-        return self.agent.networks()
-
-    def actor_chunk(self, observation: Tensor, batch: dict[str, Any] | None = None) -> Tensor:
-        """Mean of the policy's Gaussian (B, 1, A) for observations (B, O)."""
-        return self.agent.mean_action(observation, self.config.iql.beta)[:, None]
 
     def compute_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """Value, critic and actor losses on a batch of transitions.
@@ -67,7 +44,3 @@ class E2EIQLPolicy(E2EPolicy):
             following = self.observation(images[:, 1], self.state_at(batch, 1), tasks)  # (B, O)
         action = self.scaled_actions(batch)  # (B, A)
         return self.agent.loss(now, following, action, *self.rewards_and_ends(batch))
-
-    def update(self) -> None:
-        """Move the target critics; LeRobot calls this after every optimizer step."""
-        self.agent.update_target()

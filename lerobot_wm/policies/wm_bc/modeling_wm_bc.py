@@ -2,11 +2,9 @@
 
 from typing import Any
 
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_wm.policies.common.bc import BCPolicy
-from lerobot_wm.policies.common.config import compiled
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 
@@ -17,11 +15,6 @@ class WMBCPolicy(BCPolicy, LatentPolicy):
     config_class = WMBCConfig
     name = "wm_bc"
     config: WMBCConfig  # type: ignore[assignment]
-
-    def prepare_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
-        """Compile the loss, with `compile_model`."""
-        if self.config.compile_model:
-            self.loss = compiled(self.loss)  # type: ignore[method-assign]
 
     def get_optim_params(self) -> dict:
         """The head's parameters: the world model is frozen."""
@@ -39,4 +32,4 @@ class WMBCPolicy(BCPolicy, LatentPolicy):
             The scalar loss, which has no parts.
         """
         tasks = self.one_hot_tasks(batch, self.batch_size(batch))  # (B, N)
-        return self.bc_loss(self.observation_at(batch, tasks), batch), {}
+        return self.head_loss(self.observation_at(batch, tasks), batch), {}
