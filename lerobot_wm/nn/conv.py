@@ -1,4 +1,4 @@
-"""Dreamer's image encoder and decoder for 64x64 frames (Hafner et al. 2019, as laid out in TorchRL)."""
+"""Dreamer's image encoder and decoder (Hafner et al. 2019, as laid out in TorchRL), and the same for larger images."""
 
 from itertools import pairwise
 
@@ -8,27 +8,32 @@ from torch.nn import functional as F
 
 from lerobot_wm.nn.fast_cpu import UpsamplingConv
 
-IMAGE_SIZE = 64  # the strides and kernels below fix it: 64-31-14-6-2 down, 1-5-13-30-64 up
-ENCODER_CHANNELS = (32, 64, 128, 256)
-EMBED_DIM = ENCODER_CHANNELS[-1] * 2 * 2
+PAPER_SIZE = 64  # its kernels below fix it: 64-31-14-6-2 down, 1-5-13-30-64 up
+_CHANNELS = (32, 64, 128, 256)
+_HALVINGS = 2 ** len(_CHANNELS)
 
 
 class ConvEncoder(nn.Module):
-    """Four convolutions (kernel 4, stride 2, no padding) with ReLU: 64x64 image -> 1024 features."""
+    """Four convolutions (kernel 4, stride 2) with ReLU: image -> features.
 
-    def __init__(self, image_channels: int) -> None:
+    Padding is 0 for 64x64, as in the paper, and 1 for other sizes, which are halved exactly.
+    """
+
+    def __init__(self, image_channels: int, image_size: int = PAPER_SIZE) -> None:
         super().__init__()
-        channels = (image_channels, *ENCODER_CHANNELS)
+        is_paper = image_size == PAPER_SIZE
+        self.embed_dim = _CHANNELS[-1] * (2 if is_paper else image_size // _HALVINGS) ** 2  # 1024 for 64x64
         layers: list[nn.Module] = []
-        for c_in, c_out in pairwise(channels):
-            layers += [nn.Conv2d(c_in, c_out, kernel_size=4, stride=2), nn.ReLU(inplace=True)]
+        for c_in, c_out in pairwise((image_channels, *_CHANNELS)):
+            conv = nn.Conv2d(c_in, c_out, kernel_size=4, stride=2, padding=0 if is_paper else 1)
+            layers += [conv, nn.ReLU(inplace=True)]
         self.layers = nn.Sequential(*layers)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Map images (N, C, 64, 64) in [0, 1] to embeddings e_t (N, 1024)."""
+        """Map images (N, C, S, S) in [0, 1] to embeddings e_t (N, E)."""
         # channels_last is 1.3-1.5 times faster on CPUs and lets GPUs use tensor cores. The weights keep the default
         # layout: LeRobot cannot save the optimizer state of channels_last weights.
-        features = self.layers(images.contiguous(memory_format=torch.channels_last))  # (N, 256, 2, 2)
+        features = self.layers(images.contiguous(memory_format=torch.channels_last))  # (N, 256, H', W')
         return features.flatten(1)
 
 
@@ -37,8 +42,8 @@ class ConvDecoder(nn.Module):
 
     def __init__(self, latent_dim: int, image_channels: int) -> None:
         super().__init__()
-        self.input = nn.Linear(latent_dim, EMBED_DIM)
-        self.first = nn.ConvTranspose2d(EMBED_DIM, 128, kernel_size=5, stride=2)
+        self.input = nn.Linear(latent_dim, 1024)
+        self.first = nn.ConvTranspose2d(1024, 128, kernel_size=5, stride=2)
         self.layers = nn.Sequential(
             nn.ReLU(inplace=True),
             UpsamplingConv(128, 64, kernel_size=5),
@@ -56,3 +61,31 @@ class ConvDecoder(nn.Module):
         patch = F.linear(hidden, weight.T).unflatten(1, (5, 5, 128)).permute(0, 3, 1, 2)  # (N, 128, 5, 5)
         bias = self.first.get_parameter("bias")  # (128,)
         return self.layers(patch + bias[:, None, None].to(patch.dtype))
+
+
+class DoublingDecoder(nn.Module):
+    """Linear to a map of S/16 x S/16, then four transposed convolutions that double it: latent -> SxS image."""
+
+    def __init__(self, latent_dim: int, image_channels: int, image_size: int) -> None:
+        super().__init__()
+        self.side = image_size // _HALVINGS
+        self.input = nn.Linear(latent_dim, _CHANNELS[-1] * self.side**2)
+        layers: list[nn.Module] = []
+        for c_in, c_out in pairwise((*reversed(_CHANNELS), image_channels)):
+            layers += [
+                nn.ReLU(inplace=True),
+                nn.ConvTranspose2d(c_in, c_out, kernel_size=4, stride=2, padding=1),
+            ]
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, latents: Tensor) -> Tensor:
+        """Map latents s_t (N, latent_dim) to image means (N, C, S, S)."""
+        hidden = self.input(latents).unflatten(1, (_CHANNELS[-1], self.side, self.side))
+        return self.layers(hidden.contiguous(memory_format=torch.channels_last))
+
+
+def make_decoder(latent_dim: int, image_channels: int, image_size: int) -> nn.Module:
+    """The paper's decoder for 64x64, and one that doubles for other sizes."""
+    if image_size == PAPER_SIZE:
+        return ConvDecoder(latent_dim, image_channels)
+    return DoublingDecoder(latent_dim, image_channels, image_size)

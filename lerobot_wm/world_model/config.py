@@ -34,6 +34,8 @@ class RSSMConfig:
             shift would move the position but not the action.
         predict_reward: Whether there is a reward head. Turned off for datasets without a reward.
         use_proprio: Encode and reconstruct proprioception beside the image (the variant that the paper discarded).
+        image_size: Height and width S of the images that the model sees, a multiple of 16; the paper's is 64. Time and
+            memory grow with its square.
         image_channels: Channels of the image. Set from the dataset.
         action_dim: Size of the action. Set from the dataset.
         proprio_dim: Size of the proprioceptive state. Set from the dataset when `use_proprio`.
@@ -54,6 +56,7 @@ class RSSMConfig:
     image_shift: int = 0
     predict_reward: bool = True
     use_proprio: bool = False
+    image_size: int = 64
     image_channels: int = 0
     action_dim: int = 0
     proprio_dim: int = 0
@@ -63,6 +66,8 @@ class RSSMConfig:
             raise ValueError(f"decode_share is {self.decode_share:g}; expected above 0 and at most 1.")
         if not 0 <= (self.hidden_action_share or 0) <= 1:
             raise ValueError(f"hidden_action_share is {self.hidden_action_share:g}; expected 0 to 1.")
+        if self.image_size < 32 or self.image_size % 16:
+            raise ValueError(f"image_size is {self.image_size}; expected a multiple of 16, at least 32.")
         if self.min_std <= 0:
             raise ValueError(f"min_std is {self.min_std:g}; expected a standard deviation above 0.")
         for name in ("kl_scale", "free_nats", "reward_scale", "action_scale", "image_shift"):

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_wm.nn.conv import EMBED_DIM, ConvDecoder, ConvEncoder
+from lerobot_wm.nn.conv import ConvEncoder, make_decoder
 from lerobot_wm.nn.images import random_crop
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
@@ -30,9 +30,10 @@ class WorldModel(LatentModel):
     def __init__(self, config: RSSMConfig) -> None:
         super().__init__()
         self.config = config
-        self.encoder = ConvEncoder(config.image_channels)
-        self.rssm = RSSM(config, EMBED_DIM)
-        self.decoder = ConvDecoder(config.latent_dim, config.image_channels)
+        self.encoder = ConvEncoder(config.image_channels, config.image_size)
+        embed_dim = self.encoder.embed_dim
+        self.rssm = RSSM(config, embed_dim)
+        self.decoder = make_decoder(config.latent_dim, config.image_channels, config.image_size)
         self.action_scaling = Affine(config.action_dim)
         if config.standardize_images:
             self.image_scaling = Affine(config.image_channels)
@@ -42,7 +43,7 @@ class WorldModel(LatentModel):
             self.action_head = MLP(config.latent_dim, [config.hidden_dim] * 2, config.action_dim)
         if config.use_proprio:
             self.proprio_scaling = Affine(config.proprio_dim)
-            self.proprio_fusion = MLP(EMBED_DIM + config.proprio_dim, [EMBED_DIM], EMBED_DIM)
+            self.proprio_fusion = MLP(embed_dim + config.proprio_dim, [embed_dim], embed_dim)
             self.proprio_decoder = MLP(config.latent_dim, [config.hidden_dim] * 2, config.proprio_dim)
 
     @property
@@ -54,11 +55,11 @@ class WorldModel(LatentModel):
         """Compute the image embeddings e_t.
 
         Args:
-            images: (B, T, C, 64, 64) in [0, 1].
+            images: (B, T, C, S, S) in [0, 1].
             proprio: (B, T, P), read only with `config.use_proprio`.
 
         Returns:
-            (B, T, 1024).
+            (B, T, E).
         """
         batch_time = images.shape[:2]
         if self.config.standardize_images:
@@ -78,7 +79,7 @@ class WorldModel(LatentModel):
         """Filter the next frames of a running episode, given the action before each.
 
         Args:
-            images: o_t, (B, T, C, 64, 64) in [0, 1].
+            images: o_t, (B, T, C, S, S) in [0, 1].
             prev_actions: a_{t-1}, (B, T, A) in the dataset's units. At the start of an episode the first is ignored.
             state: s before the first frame, (B, ·); None starts an episode.
             proprio: (B, T, P), with `config.use_proprio`.
@@ -93,7 +94,7 @@ class WorldModel(LatentModel):
         """Filter whole episodes, given the action executed *at* each frame.
 
         Args:
-            images: o_t, (B, T, C, 64, 64) in [0, 1], from an episode's first frame on.
+            images: o_t, (B, T, C, S, S) in [0, 1], from an episode's first frame on.
             actions: a_t, (B, T, A) in the dataset's units. The last one is ignored.
             proprio: (B, T, P), with `config.use_proprio`.
 
@@ -103,7 +104,7 @@ class WorldModel(LatentModel):
         return self.filter_embeds(self.embed(images, proprio), actions)
 
     def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> RSSMState:
-        """Filter whole episodes from their embeddings (B, T, 1024) and actions a_t (B, T, A).
+        """Filter whole episodes from their embeddings (B, T, E) and actions a_t (B, T, A).
 
         z_t is the posterior mean, or drawn from the posterior with `sample`.
         """
@@ -119,11 +120,11 @@ class WorldModel(LatentModel):
         return self.rssm.imagine(state, self.action_scaling(actions))
 
     def decode(self, latents: Tensor) -> Tensor:
-        """Decode latents (..., D+S) to images (..., C, 64, 64), clipped to [0, 1]."""
+        """Decode latents (..., D+S) to images (..., C, S, S), clipped to [0, 1]."""
         return self._decode(latents).clamp(0, 1)
 
     def expected_images(self, state: RSSMState) -> Tensor:
-        """Predict o_t (B, C, 64, 64) from s_{t-1} and a_{t-1}, given the state s_t (B, ·) after it.
+        """Predict o_t (B, C, S, S) from s_{t-1} and a_{t-1}, given the state s_t (B, ·) after it.
 
         With `hidden_action_share` above 0 the prediction does not know a_{t-1}.
         """
@@ -148,7 +149,7 @@ class WorldModel(LatentModel):
         frames although the first has none, so its weight is (T-1)/T of `reward_scale`.
 
         Args:
-            images: (B, T, C, 64, 64) in [0, 1].
+            images: (B, T, C, S, S) in [0, 1].
             actions: a_t, (B, T, A) in the dataset's units.
             valid: (B, T) bool, False where a window runs past the end of its episode.
             rewards: r_t, (B, T); needed with `config.predict_reward`.
@@ -178,14 +179,14 @@ class WorldModel(LatentModel):
         return world_model_loss(errors, kl, valid, self.config)
 
     def _decode(self, latents: Tensor) -> Tensor:
-        """Decode latents (..., D+S) to images (..., C, 64, 64) in float32, not clipped."""
+        """Decode latents (..., D+S) to images (..., C, S, S) in float32, not clipped."""
         images = self.decoder(latents.flatten(0, -2)).float()
         if self.config.standardize_images:
             images = self.image_scaling.inverse(images.movedim(-3, -1)).movedim(-1, -3)
         return images.unflatten(0, latents.shape[:-1])
 
     def _image_loss(self, latents: Tensor, images: Tensor) -> Tensor:
-        """Compute the error (B, T) of the images (B, T, C, 64, 64) decoded from latents (B, T, D+S).
+        """Compute the error (B, T) of the images (B, T, C, S, S) decoded from latents (B, T, D+S).
 
         In training with `decode_share` below 1, only some frames of each window are decoded. Their errors are scaled
         up so that the expected mean stays the same; the other frames have an error of 0.
@@ -196,7 +197,7 @@ class WorldModel(LatentModel):
             return reconstruction_loss(self._decode(latents), images)
         window = torch.arange(windows, device=images.device)[:, None]  # (B, 1)
         frame = torch.rand(windows, length, device=images.device).argsort(1)[:, :few]  # (B, few)
-        decoded = self._decode(latents[window, frame])  # (B, few, C, 64, 64)
+        decoded = self._decode(latents[window, frame])  # (B, few, C, S, S)
         error = reconstruction_loss(decoded, images[window, frame])  # (B, few)
         return error.new_zeros(windows, length).scatter(1, frame, error * length / few)
 
@@ -216,7 +217,7 @@ class WorldModel(LatentModel):
         return 0.5 * (from_memory + from_frame)
 
     def _shift_images(self, images: Tensor) -> Tensor:
-        """Shift each frame of images (B, T, C, 64, 64) by up to `image_shift` pixels, in training only."""
+        """Shift each frame of images (B, T, C, S, S) by up to `image_shift` pixels, in training only."""
         if self.config.image_shift == 0 or not self.training:
             return images
         return random_crop(images.flatten(0, 1), self.config.image_shift).unflatten(0, images.shape[:2])

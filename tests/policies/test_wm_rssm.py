@@ -12,6 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file, save_file
 
 from lerobot_wm.data.loader import RamDataset
+from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
@@ -59,6 +60,25 @@ def test_plain_lerobot_train_takes_the_same_flags(
     stats, scaling = demos.meta.stats["observation.image"], policy.world_model.image_scaling
     np.testing.assert_allclose(scaling.offset, stats["mean"].flatten(), rtol=1e-6)
     np.testing.assert_allclose(scaling.scale, stats["std"].flatten(), rtol=1e-6)
+
+
+def test_a_policy_acts_on_latents_of_larger_images(
+    demos_root: Path, demos: LeRobotDataset, tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    """The size reaches the frames in memory, the encoded dataset and the images at test time."""
+    data = f"{TRAIN_FLAGS} {DATASET_FLAGS.format(root=demos_root)}"
+    lerobot_wm_command(f"train {SHORT} {data} --policy.rssm.image_size=96 --output_dir={tmp_path / 'wm'}")
+    world_model = tmp_path / "wm" / "checkpoints" / "last" / "pretrained_model"
+    assert WMRSSMPolicy.from_pretrained(world_model).world_model.encoder.embed_dim == 256 * 6**2
+    lerobot_wm_command(
+        f"train --policy.type=wm_bc --policy.world_model_path={world_model} --steps=2 --batch_size=4 {data}",
+        f"--output_dir={tmp_path / 'bc'}",
+    )
+    policy = WMBCPolicy.from_pretrained(tmp_path / "bc" / "checkpoints" / "last" / "pretrained_model")
+    assert policy.config.image_size == (96, 96)
+    frame = demos[0]
+    batch = {key: frame[key][None] for key in ("observation.image", "observation.state")}
+    assert policy.select_action({**batch, "task": [frame["task"]]}).isfinite().all()
 
 
 def test_images_without_statistics_are_not_scaled(

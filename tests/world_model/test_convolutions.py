@@ -2,7 +2,8 @@ import pytest
 import torch
 from torch import nn
 
-from lerobot_wm.nn.conv import ConvDecoder, ConvEncoder, UpsamplingConv
+from lerobot_wm.nn.conv import ConvDecoder, ConvEncoder, make_decoder
+from lerobot_wm.nn.fast_cpu import UpsamplingConv
 
 
 def test_decoder_equals_its_transposed_convolutions() -> None:
@@ -17,6 +18,13 @@ def test_decoder_equals_its_transposed_convolutions() -> None:
 def test_shapes() -> None:
     assert ConvEncoder(6)(torch.zeros(2, 6, 64, 64)).shape == (2, 1024)
     assert ConvDecoder(16, 6)(torch.zeros(2, 16)).shape == (2, 6, 64, 64)
+
+
+@pytest.mark.parametrize("size", [32, 64, 80, 128])
+def test_encoder_and_decoder_follow_the_image_size(size: int) -> None:
+    encoder = ConvEncoder(3, size)
+    assert encoder(torch.zeros(2, 3, size, size)).shape == (2, encoder.embed_dim)
+    assert make_decoder(16, 3, size)(torch.zeros(2, 16)).shape == (2, 3, size, size)
 
 
 @pytest.mark.parametrize("kernel_size", [5, 6])

@@ -170,7 +170,7 @@ def _example(config: PolicyConfig, settings: dict) -> str:
     """A line of Python that makes inputs of the right shapes."""
     if config.type == "wm_rssm":
         rssm = settings["rssm"]
-        shapes = [(1, 5, rssm["image_channels"], IMAGE_SIZE, IMAGE_SIZE), (1, 5, rssm["action_dim"])]
+        shapes = [(1, 5, rssm["image_channels"], *[rssm["image_size"]] * 2), (1, 5, rssm["action_dim"])]
         proprio = f", torch.zeros(1, 5, {rssm['proprio_dim']})" if rssm["use_proprio"] else ""
         return f"inputs = (torch.rand{shapes[0]}, torch.zeros{shapes[1]}{proprio})  # 5 images, a_t at each"
     batch = [

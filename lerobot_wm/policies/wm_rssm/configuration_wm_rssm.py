@@ -9,7 +9,6 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.constants import ACTION, REWARD
 from lerobot_wm.data.tables import last_action_predicts_next
-from lerobot_wm.nn.conv import IMAGE_SIZE
 from lerobot_wm.policies.common.features import feature_dim
 from lerobot_wm.policies.common.iql import reward_columns
 from lerobot_wm.policies.common.optim import FusedAdamConfig
@@ -91,7 +90,7 @@ class WMRSSMConfig(WorldModelConfig):
     @property
     def image_size(self) -> tuple[int, int]:
         """The model's own size."""
-        return IMAGE_SIZE, IMAGE_SIZE
+        return self.rssm.image_size, self.rssm.image_size
 
     def has_reward(self, dataset_meta: LeRobotDatasetMetadata) -> bool:
         """Whether the dataset has a reward to predict.
