@@ -163,6 +163,8 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
     """
     tasks, variations = resolve_tasks(config.tasks), parse_variations(config.variations)
     check_variation_set(config.variation_set)
+    if config.episodes_per_task < 1:
+        raise ValueError(f"--episodes_per_task={config.episodes_per_task}: expected at least 1.")
     for description, (first_task, *others) in tasks_of_one_description(tasks).items():
         kept = ",".join(task for task in tasks if task not in others)
         raise ValueError(

@@ -70,7 +70,7 @@ def frame_values(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
             f"download {meta.repo_id} to that folder first."
         )
     for path in paths:
-        table = pq.read_table(path, columns=["index", key])
+        table = pq.read_table(path, columns=list({"index", key}))
         index, values = (
             np.concatenate([_flat_values(chunk) for chunk in table[name].chunks]) for name in ("index", key)
         )
@@ -78,6 +78,13 @@ def frame_values(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
             -1, *numbers.shape[1:]
         )
     return numbers
+
+
+def frames_on_disk(meta: LeRobotDatasetMetadata, *keys: str) -> list[Tensor]:
+    """Numeric columns of the frames that are on this machine, in their order: (N, size) float32 each."""
+    index = frame_values(meta, "index").long()
+    here = index == torch.arange(meta.total_frames)  # zero elsewhere
+    return [frame_values(meta, key).view(meta.total_frames, -1)[here] for key in keys]
 
 
 def _tables(meta: LeRobotDatasetMetadata) -> list[Path]:
@@ -96,8 +103,8 @@ def last_action_predicts_next(meta: LeRobotDatasetMetadata) -> bool:
     """
     if not _tables(meta):
         return False
-    action = frame_values(meta, ACTION).reshape(meta.total_frames, -1)  # (N, A)
-    same_episode = frame_values(meta, "episode_index").diff() == 0  # (N - 1,)
+    action, episode = frames_on_disk(meta, ACTION, "episode_index")  # (N, A), (N, 1)
+    same_episode = episode.flatten().diff() == 0  # (N - 1,)
     change, spread = action.diff(dim=0)[same_episode].std(0), action.std(0)  # (A,)
     moves = spread > 0
     return bool(moves.any()) and (change[moves] / spread[moves]).median().item() <= _SMALL_CHANGE
@@ -108,7 +115,7 @@ _RELATIVE_SPREAD = 0.5
 _NO_DISTANCE = 1e-4
 
 
-def relative_to_state(meta: LeRobotDatasetMetadata, state_key: str = OBS_STATE) -> list[int]:
+def relative_to_state(meta: LeRobotDatasetMetadata) -> list[int]:
     """The numbers of the action that are targets for the same number of the state, such as a joint's position.
 
     The state must have as many numbers as the action, and the difference of the two at most half the standard deviation
@@ -117,10 +124,10 @@ def relative_to_state(meta: LeRobotDatasetMetadata, state_key: str = OBS_STATE) 
     Returns:
         Their indices; none for a dataset whose tables are not on this machine.
     """
-    shapes = [tuple(meta.features.get(key, {"shape": ()})["shape"]) for key in (ACTION, state_key)]
+    shapes = [tuple(meta.features.get(key, {"shape": ()})["shape"]) for key in (ACTION, OBS_STATE)]
     if shapes[0] != shapes[1] or not _tables(meta):
         return []
-    action, state = (frame_values(meta, key).view(-1, *shapes[0]) for key in (ACTION, state_key))  # (N, A)
+    action, state = frames_on_disk(meta, ACTION, OBS_STATE)  # (N, A) each
     spread, distance = action.std(0), (action - state).std(0)  # (A,)
     chosen = (spread > 0) & (distance <= _RELATIVE_SPREAD * spread)  # (A,)
     if chosen.any() and (distance[chosen] <= _NO_DISTANCE * spread[chosen]).all():

@@ -49,8 +49,18 @@ class Ledger:
         return self._own | self.committed
 
     def add(self, files: list[Path]) -> None:
-        """Add the rollouts of an arm and seed."""
-        self._own |= self._finished_runs(files)
+        """Add the rollouts of an arm and seed.
+
+        Raises:
+            ValueError: The files do not hold all of them.
+        """
+        finished = self._finished_runs(files)
+        if not finished:
+            raise ValueError(
+                f"{', '.join(map(str, files))}: these are not all rollouts of an arm in preset {self._preset.name}. "
+                "Remove their folders to roll out again."
+            )
+        self._own |= finished
         _write(self._own_path, self._own)
 
     def write(self) -> None:
@@ -262,7 +272,10 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main() -> None:
     """Entry point of `scripts/reproduce_table1.py`."""
-    args = make_parser().parse_args()
+    parser = make_parser()
+    args = parser.parse_args()
+    if args.processes < 1:
+        parser.error(f"--processes={args.processes}: expected at least 1")
     console = Console()
     try:
         preset = load_preset(args.preset)

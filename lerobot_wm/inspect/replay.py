@@ -31,6 +31,7 @@ from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.files import write_whole
 from lerobot_wm.inspect.episodes import CheckpointConfig, check_episodes, episodes_by_task
 from lerobot_wm.inspect.pictures import PNG, figure_bytes
+from lerobot_wm.policies.common.actions import RolloutNoise
 from lerobot_wm.policies.common.checkpoint import checkpoint_file, open_checkpoint, read_json, split_revision
 from lerobot_wm.policies.common.checks import check_reads
 from lerobot_wm.policies.common.config import PolicyConfig
@@ -94,16 +95,22 @@ class Replayed:
         self.policy: PreTrainedPolicy = policy_class.from_pretrained(
             folder, config=config, revision=revision
         ).eval()
-        self._before, self._after = make_pre_post_processors(config, pretrained_path=folder)
+        device = {"device_processor": {"device": str(config.device)}}  # it may have been trained on another
+        self._before, self._after = make_pre_post_processors(
+            config, pretrained_path=folder, pretrained_revision=revision, preprocessor_overrides=device
+        )
         self.keys = list(config.input_features)
-        # The policy that is told the recorded actions shares the networks, and has a memory of its own.
-        self._told = copy.copy(self.policy) if isinstance(self.policy, LatentPolicy) else None
+        # Where the filter reads actions, a second policy is given the recorded ones. It shares the networks, and has a
+        # memory and random numbers of its own.
+        self._with_recorded = copy.copy(self.policy) if _reads_actions(self.policy) else None
+        if self._with_recorded is not None:
+            self._with_recorded._noise = RolloutNoise()
 
     def reset(self) -> None:
         """Begin an episode."""
         self.policy.reset()
-        if self._told is not None:
-            self._told.reset()
+        if self._with_recorded is not None:
+            self._with_recorded.reset()
 
     def actions(self, frame: dict[str, Any], last_action: Tensor | None) -> dict[str, Tensor]:
         """The action (A,) for the next frame of the episode, by what the policy's memory was told.
@@ -114,10 +121,10 @@ class Replayed:
         """
         batch = self._before({key: frame[key] for key in (*self.keys, TASK)})
         actions = {OWN: self._act(self.policy, batch)}
-        if self._told is not None:
+        if self._with_recorded is not None:
             if last_action is not None:
-                self._told.executed(last_action[None])
-            actions[RECORDED] = self._act(self._told, batch)
+                self._with_recorded.executed(last_action[None])
+            actions[RECORDED] = self._act(self._with_recorded, batch)
         return actions
 
     def _act(self, policy: PreTrainedPolicy, batch: dict[str, Any]) -> Tensor:
@@ -160,6 +167,13 @@ class Replay:
             "trained": [e for e in self.recorded if e not in self.held_out],
         }
         return {name: episodes for name, episodes in groups.items() if episodes}
+
+
+def _reads_actions(policy: PreTrainedPolicy) -> bool:
+    """Whether what a policy does depends on the actions that were executed before."""
+    if not isinstance(policy, LatentPolicy) or not policy.config.use_latent:
+        return False
+    return "hidden_actions" not in policy.world_model.encoding_settings
 
 
 def replay(cfg: ReplayConfig) -> Replay:

@@ -16,17 +16,17 @@ class Affine(nn.Module):
     offset: Tensor
     scale: Tensor
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, *shape: int) -> None:
         super().__init__()
-        self.register_buffer("offset", torch.zeros(dim))
-        self.register_buffer("scale", torch.ones(dim))
+        self.register_buffer("offset", torch.zeros(shape))
+        self.register_buffer("scale", torch.ones(shape))
 
     def set_standard(self, mean: Tensor, std: Tensor) -> None:
-        """Scale to zero mean and unit standard deviation; mean and std are (dim,)."""
+        """Scale to zero mean and unit standard deviation; mean and std are of the module's shape."""
         self._set(mean, std)
 
     def set_range(self, low: Tensor, high: Tensor) -> None:
-        """Scale [low, high] to [-1, 1]; low and high are (dim,)."""
+        """Scale [low, high] to [-1, 1]; low and high are of the module's shape."""
         self._set((low + high) / 2, (high - low) / 2)
 
     def _set(self, offset: Tensor, scale: Tensor) -> None:
@@ -39,9 +39,9 @@ class Affine(nn.Module):
         self.scale.copy_(torch.where(scale > _EPS, scale, torch.zeros_like(scale)))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalize x, (..., dim)."""
+        """Normalize x, (..., *shape)."""
         return (x - self.offset) / torch.where(self.scale > 0, self.scale, 1.0)
 
     def inverse(self, x: Tensor) -> Tensor:
-        """Undo `forward` on x, (..., dim)."""
+        """Undo `forward` on x, (..., *shape)."""
         return x * self.scale + self.offset

@@ -21,9 +21,9 @@ class FlowHead(nn.Module):
 
     Args:
         observation_dim: O.
-        hidden_dims: Width of each layer, of which each adds to the one before.
+        hidden_dims: Widths of the layers that read the observation; the first is also that of as many residual blocks.
         output_dim: Size of the sampled vector, N.
-        dropout: Dropout of the layers.
+        dropout: Dropout of the layers that read the observation.
     """
 
     frequencies: Tensor
@@ -50,7 +50,8 @@ class FlowHead(nn.Module):
         hidden = features + self.enter(torch.cat([x, angles.sin(), angles.cos()], dim=-1))  # (B, width)
         for block in self.blocks:
             hidden = hidden + block(hidden)
-        return self.leave(hidden)
+        with torch.autocast(x.device.type, enabled=False):  # in float32, as MLP's last layer
+            return self.leave(hidden.float())
 
     def errors(self, observation: Tensor, actions: Tensor) -> Tensor:
         """Squared errors (B, N) of the field at a random point of each sample, given actions (B, N)."""
@@ -58,7 +59,7 @@ class FlowHead(nn.Module):
         tau = torch.rand(len(actions), 1, device=actions.device)  # (B, 1)
         point = torch.lerp(noise, actions, tau)
         velocity = self.velocity(self.observe(observation), point, tau)
-        return (velocity.float() - (actions - noise)).square()
+        return (velocity - (actions - noise)).square()
 
     def forward(self, observation: Tensor, noise: Tensor) -> Tensor:
         """Actions (B, N) that the flow carries noise (B, N) to, given observations (B, O)."""

@@ -91,11 +91,12 @@ def test_chunks_of_targets_relative_to_the_state_keep_their_range(arm: LeRobotDa
     assert policy.config.relative_indices == [0, 1]
     frames = [arm[t] for t in range(LENGTH)]
     action, state = (torch.stack([f[key] for f in frames]) for key in ("action", "observation.state"))
-    for t in range(LENGTH - CHUNK):
-        scaled = policy.scaled(action[None, t : t + CHUNK], state[t : t + 1])
-        assert scaled.abs().max() < 1.001
-        back = policy.unscaled(scaled, state[t : t + 1])
-        torch.testing.assert_close(back[0], action[t : t + CHUNK])
+    chunks = action.unfold(0, CHUNK, 1).movedim(-1, 1)  # (N, K, A)
+    first = state[: len(chunks)]
+    scaled = policy.scaled(chunks, first)
+    # Each step of a chunk spans the range: later ones reach further, and would outweigh the first.
+    torch.testing.assert_close(scaled.abs().amax((0, 2)), torch.ones(CHUNK), atol=1e-3, rtol=0)
+    torch.testing.assert_close(policy.unscaled(scaled, first), chunks)
 
 
 def test_the_filter_reads_every_frame_between_predictions(
@@ -123,6 +124,23 @@ def test_the_filter_reads_every_frame_between_predictions(
     with torch.no_grad():
         states = policy.world_model.filter(resized, actions[None])
     torch.testing.assert_close(policy._filter_state.latent, states.last().latent, atol=2e-5, rtol=2e-5)
+
+
+def test_noise_stays_within_the_range_of_each_step(arm: LeRobotDataset) -> None:
+    exact, noisy = (
+        make(
+            WMBCConfig(device="cpu", push_to_hub=False, use_latent=False, chunk_size=CHUNK, action_noise=std),
+            arm,
+        )
+        for std in (0.0, 0.5)
+    )
+    noisy.load_state_dict(exact.state_dict())
+    batch = {"observation.state": torch.zeros(1, 2)}
+    mean, drawn = (policy.predict_action_chunk(batch) for policy in (exact, noisy))
+    assert not torch.equal(mean, drawn)
+    assert noisy.scaled(drawn, torch.zeros(1, 2)).abs().max() < 1.001
+    noisy.reset()
+    assert torch.equal(drawn, noisy.predict_action_chunk(batch))  # the rollout repeats
 
 
 def test_settings_that_do_not_fit_are_refused() -> None:

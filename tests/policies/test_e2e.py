@@ -89,7 +89,7 @@ def test_select_action_is_the_mean_of_what_is_trained_clipped(policy_type: str) 
         torch.nn.init.ones_(policy.actor.head.bias)
     tasks = torch.eye(2)[[0, 1, 0]]
     observation = policy.observation(frames[CAMERA], frames[STATE], tasks)
-    mean = policy.actor_mean(observation)
+    mean = policy.actor_chunk(observation)[:, 0]
     low, high = torch.tensor(STATS["action"]["min"]), torch.tensor(STATS["action"]["max"])
     expected = low + (mean.clamp(-1, 1) + 1) / 2 * (high - low)
     action = policy.select_action(frames)
@@ -192,7 +192,7 @@ def test_beta_chooses_among_the_trained_actors(tmp_path: Path) -> None:
     observation = torch.randn(2, policy.observation_dim)
     for i, beta in enumerate(policy.config.iql.trained_betas):
         mean, _ = policy.agent.actors[i].eval()(observation)
-        assert torch.equal(load(beta).actor_mean(observation), mean)
+        assert torch.equal(load(beta).actor_chunk(observation)[:, 0], mean)
     with pytest.raises(ValueError, match=r"beta 7; it has actors for betas 0\.5, 0, 3"):
         load(7)
 

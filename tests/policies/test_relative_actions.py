@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wm.data.tables import relative_to_state
+from lerobot_wm.data.tables import frames_on_disk, relative_to_state
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.world_model.config import RSSMConfig
@@ -49,6 +51,28 @@ def test_targets_are_told_from_velocities(arm: LeRobotDataset, demos: LeRobotDat
     assert relative_to_state(arm.meta) == [0, 1]
     # Meta-World: four velocities beside a state of four numbers.
     assert relative_to_state(demos.meta) == []
+
+
+def test_episodes_that_are_not_on_this_machine_do_not_count(arm: LeRobotDataset, tmp_path: Path) -> None:
+    """Their frames read as zeros, which would lie far from joints that stay near another place."""
+
+    def far(t: int, length: int) -> dict[str, Any]:
+        frame = joints(t, length)
+        return {
+            "observation.state": frame["observation.state"] + 100,
+            "action": np.cos(t * np.arange(1, 4)) + 100,
+        }
+
+    features = {"observation.state": vector(3), "action": vector(3)}
+    dataset = record(tmp_path / "dataset", features, [("Lift", 30)] * 2, far)
+    assert relative_to_state(dataset.meta) == []
+    [table] = (dataset.root / "data").rglob("*.parquet")
+    rows = pq.read_table(table)
+    pq.write_table(rows.slice(0, 30), table)
+    assert relative_to_state(dataset.meta) == []
+    action, episode = frames_on_disk(dataset.meta, "action", "episode_index")
+    assert action.shape == (30, 3)
+    assert episode.max() == 0
 
 
 def test_the_filter_is_not_told_actions_that_the_last_one_predicts(
@@ -104,6 +128,10 @@ def test_false_learns_actions_as_recorded(
 ) -> None:
     path = train(lerobot_wm_command, arm, tmp_path / "absolute", "--policy.relative_actions=false")
     assert json.loads((path / "config.json").read_text())["relative_indices"] == []
+    changed = PreTrainedConfig.from_pretrained(path)
+    changed.relative_actions = None
+    with pytest.raises(ValueError, match=r"relative_actions=None.*False"):
+        WMBCPolicy.from_pretrained(path, config=changed)
     far = torch.tensor([[7.0, -7.0, 0.5]])
     action = WMBCPolicy.from_pretrained(path).select_action({"observation.state": far})[0]
     assert action.abs().max() <= 1.11  # clipped to the recorded actions

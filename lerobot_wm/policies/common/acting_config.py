@@ -2,12 +2,13 @@
 
 import logging
 from dataclasses import dataclass, field
+from typing import Self
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_LATENT, OBS_STATE
 from lerobot_wm.data.tables import relative_to_state
-from lerobot_wm.policies.common.config import PolicyConfig
+from lerobot_wm.policies.common.config import PolicyConfig, train_new
 from lerobot_wm.policies.common.features import feature_dim
 from lerobot_wm.policies.common.tasks import task_names, tasks_to_learn
 
@@ -21,8 +22,8 @@ class ActingConfig(PolicyConfig):
     Args:
         hidden_dims: Widths of the hidden layers of every head.
         dropout: Dropout of the actor.
-        action_noise: Standard deviation of Gaussian noise on the actions at test time, where the dataset's actions span
-            [-1, 1]. It frees a policy that hovers in a place where no demonstration ends.
+        action_noise: Standard deviation of Gaussian noise on the actions at test time, in units in which the actions
+            that the heads learn span [-1, 1]. It frees a policy that hovers in a place where no demonstration ends.
         relative_actions: Learn targets relative to the state: the heads learn a_t minus the measured state where the
             action is a target for it, such as a joint's position. The policy still returns the dataset's units. None
             finds these numbers in the dataset (see `data.tables.relative_to_state`), true takes all, false none.
@@ -97,6 +98,15 @@ class ActingConfig(PolicyConfig):
                 self.action_dim,
             )
         return chosen
+
+    def check_unchanged(self, saved: Self) -> None:
+        """Also check that actions stay relative to the state, or absolute, as they were learned."""
+        super().check_unchanged(saved)
+        if self.relative_actions != saved.relative_actions:
+            raise ValueError(
+                f"--policy.relative_actions={self.relative_actions}: this {saved.type} was trained with "
+                f"{saved.relative_actions}. Leave the flag out, or {train_new(saved)}."
+            )
 
     @property
     def relative_state_indices(self) -> list[int]:

@@ -35,7 +35,9 @@ class ActingPolicy(BasePolicy):
     def build(self) -> None:
         """Make the scalings."""
         self.state_scaling = Affine(self.config.state_dim)
-        self.action_scaling = Affine(self.config.action_dim)
+        # The numbers of a chunk reach further with each step, where they are relative to the state at its first.
+        steps = (self.chunk_size,) if self.chunk_size > 1 else ()
+        self.action_scaling = Affine(*steps, self.config.action_dim)
         self.relative_to_state = RelativeToState(self.config)
         self._noise = RolloutNoise()
         self._actions: deque[Tensor] = deque()  # predicted and not executed yet, (B, A) each
@@ -87,11 +89,13 @@ class ActingPolicy(BasePolicy):
 
     def warn_if_actions_out_of_range(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Warn of actions in a dataset that this policy, scaled as in its first training, cannot command."""
-        low, high = action_range(
-            self.config, dataset_meta.stats or {}, dataset_meta, self.chunk_size
-        )  # (A,), on the CPU
         ends = (torch.full_like(self.action_scaling.offset, end) for end in (-1.0, 1.0))
-        lowest, highest = (self.action_scaling.inverse(end).cpu() for end in ends)  # (A,)
+        ranges = (
+            *action_range(self.config, dataset_meta.stats or {}, dataset_meta, self.chunk_size),
+            *(self.action_scaling.inverse(end).cpu() for end in ends),
+        )
+        # (A,) each, on the CPU; of chunks the first step.
+        low, high, lowest, highest = (ends.view(-1, self.config.action_dim)[0] for ends in ranges)
         tolerance = _RANGE_TOLERANCE * (high - low)
         outside = (low < lowest - tolerance) | (high > highest + tolerance)
         for i in torch.nonzero(outside).flatten().tolist():
@@ -152,10 +156,6 @@ class ActingPolicy(BasePolicy):
         """
         raise NotImplementedError
 
-    def actor_mean(self, observation: Tensor) -> Tensor:
-        """The policy's next action (B, A), scaled to [-1, 1], for observations (B, O)."""
-        return self.actor_chunk(observation)[:, 0]
-
     def act(self, observation: Tensor, state: Tensor) -> Tensor:
         """The policy's next action, clipped to the dataset's range, in its units.
 
@@ -166,7 +166,7 @@ class ActingPolicy(BasePolicy):
         Returns:
             (B, A).
         """
-        return self.unscaled(self.actor_mean(observation).clamp(-1, 1), state)
+        return self.unscaled(self.actor_chunk(observation).clamp(-1, 1), state)[:, 0]
 
     def reset(self) -> None:
         """Forget the episode; LeRobot calls this between episodes."""
@@ -174,7 +174,7 @@ class ActingPolicy(BasePolicy):
         self.drop_queued_actions()
 
     def drop_queued_actions(self) -> None:
-        """Forget the actions that were predicted and not executed, as LeRobot asks where a person took over."""
+        """Forget the actions that were not executed yet; LeRobot after 0.6.1 calls this where a person took over."""
         self._actions.clear()
 
     def executed(self, action: Tensor) -> None:
@@ -202,7 +202,7 @@ class ActingPolicy(BasePolicy):
         observation, state = self._observe(batch)
         if not self._actions or len(self._actions[0]) != len(observation):
             self._actions = deque(self._chunk(observation, state, batch)[:, : self.n_action_steps].unbind(1))
-        action = self.with_noise(self._actions.popleft(), batch)
+        action = self._actions.popleft()
         self.executed(action)
         return action
 
@@ -210,13 +210,10 @@ class ActingPolicy(BasePolicy):
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """Read the next frame and predict all its actions, (B, K, A) in the dataset's units.
 
-        The arguments and errors are those of `select_action`, whose queue of actions it leaves alone.
+        To be called at every frame: the filter takes the first action for executed, unless `executed` is called. The
+        arguments and errors are those of `select_action`, whose queue of actions it leaves alone.
         """
-        observation, state = self._observe(batch)
-        chunk = torch.stack(
-            [self.with_noise(action, batch) for action in self._chunk(observation, state, batch).unbind(1)],
-            dim=1,
-        )
+        chunk = self._chunk(*self._observe(batch), batch)
         self.executed(chunk[:, 0])
         return chunk
 
@@ -228,16 +225,12 @@ class ActingPolicy(BasePolicy):
         return self.observe(batch, state), state
 
     def _chunk(self, observation: Tensor, state: Tensor, batch: dict[str, Any]) -> Tensor:
-        return self.unscaled(self.actor_chunk(observation, batch).clamp(-1, 1), state)
-
-    def with_noise(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
-        """Actions (B, A) with `action_noise`, clipped to the dataset's range; `batch` is that of `select_action`."""
-        if self.config.action_noise == 0:
-            return action
-        state = self.state_at(batch)
-        scaled = self.scaled(action, state)  # (B, A)
-        noisy = scaled + self.config.action_noise * self._noise(scaled, batch)
-        return self.unscaled(noisy.clamp(-1, 1), state)
+        """Actions (B, K, A) in the dataset's units, with `action_noise`, clipped to the dataset's range."""
+        chunk = self.actor_chunk(observation, batch).clamp(-1, 1)
+        if self.config.action_noise > 0:
+            noise = self._noise(chunk.flatten(1), batch).view_as(chunk)
+            chunk = (chunk + self.config.action_noise * noise).clamp(-1, 1)
+        return self.unscaled(chunk, state)
 
     def one_hot_tasks(self, batch: dict[str, Any], batch_size: int) -> Tensor:
         """One-hot task ids (B, N) from the batch's task strings, or from a single string for all of it.

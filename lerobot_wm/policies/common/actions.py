@@ -8,7 +8,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION, OBS_STATE
-from lerobot_wm.data.tables import frame_values
+from lerobot_wm.data.tables import frames_on_disk
 from lerobot_wm.policies.common.acting_config import ActingConfig
 from lerobot_wm.policies.common.features import Statistics, statistics
 from lerobot_wm.policies.common.names import recorded_name
@@ -49,25 +49,19 @@ class RelativeToState(nn.Module):
 def action_range(
     config: ActingConfig, stats: Statistics, dataset_meta: LeRobotDatasetMetadata, chunk_size: int
 ) -> tuple[Tensor, Tensor]:
-    """Lowest and highest actions (A,) of a dataset, as the heads learn them in chunks of this size."""
-    low, high = (value.clone() for value in statistics(stats, ACTION, "min", "max"))  # (A,)
+    """Lowest and highest actions of a dataset, as the heads learn them: (A,), or of each step of a chunk (K, A)."""
+    low, high = (value.repeat(chunk_size, 1) for value in statistics(stats, ACTION, "min", "max"))  # (K, A)
     chosen = config.relative_indices
     if chosen:
-        action, state = (
-            frame_values(dataset_meta, key).view(-1, config.action_dim)
-            for key in (ACTION, recorded_name(OBS_STATE))
-        )  # (N, A)
-        action, state = action[:, chosen], state[:, chosen]  # (N, R)
-        episode = frame_values(dataset_meta, "episode_index")  # (N,)
-        for k in range(chunk_size):  # a_{t+k} - s_t within episodes
-            together = episode[k:] == episode[: len(episode) - k]
-            relative = (action[k:] - state[: len(state) - k])[together]
-            if k == 0:
-                low[chosen], high[chosen] = relative.amin(0), relative.amax(0)
-            elif len(relative):
-                low[chosen] = low[chosen].minimum(relative.amin(0))
-                high[chosen] = high[chosen].maximum(relative.amax(0))
-    return low, high
+        action, state, episode = frames_on_disk(
+            dataset_meta, ACTION, recorded_name(OBS_STATE), "episode_index"
+        )  # (N, A), (N, A), (N, 1)
+        for step in range(min(chunk_size, len(action))):  # a_{t+step} - s_t, within episodes
+            together = (episode[step:] == episode[: len(episode) - step]).flatten()
+            relative = (action[step:] - state[: len(state) - step])[together][:, chosen]  # (N', R)
+            if len(relative):
+                low[step, chosen], high[step, chosen] = relative.amin(0), relative.amax(0)
+    return (low, high) if chunk_size > 1 else (low[0], high[0])
 
 
 class RolloutNoise:

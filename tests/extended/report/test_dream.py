@@ -197,7 +197,7 @@ def test_dreams_equal_one_step_at_a_time(policy_type: str, root: Path, checkpoin
             torch.testing.assert_close(imagined.images[t], model.decode(latent)[0], atol=1e-4, rtol=0)
             torch.testing.assert_close(imagined.reward[t], model.predict_reward(latent)[0], atol=1e-4, rtol=0)
         task = torch.eye(2)[[1]]
-        mean = policy.actor_mean(policy.observation(held, task, states[OWN_ACTIONS].latent))
+        mean = policy.actor_chunk(policy.observation(held, task, states[OWN_ACTIONS].latent))[:, 0]
         own = policy.action_scaling.inverse(mean.clamp(-1, 1))
 
     pictures = [imagined.images[-1] for imagined in dreams.by_actions.values()]
