@@ -60,7 +60,7 @@ def test_episodes_that_are_not_on_this_machine_do_not_count(arm: LeRobotDataset,
         frame = joints(t, length)
         return {
             "observation.state": frame["observation.state"] + 100,
-            "action": np.cos(t * np.arange(1, 4)) + 100,
+            "action": np.cos(t * np.arange(1, 4)).astype(np.float32) + 100,
         }
 
     features = {"observation.state": vector(3), "action": vector(3)}
