@@ -47,7 +47,7 @@ class Dream:
     """T frames decoded from latents: those of the filter where the model sees, imagined ones after that.
 
     Attributes:
-        images: (T, K·C, 64, 64) in [0, 1].
+        images: (T, K·C, S, S) in [0, 1].
         reward: The predicted reward that arrives with each frame, (T,); the first frame's has no meaning. None without
             a reward head.
     """
@@ -63,7 +63,7 @@ class Dreams:
     Attributes:
         context: How many of the frames the model sees.
         n_cameras: K.
-        truth: The images as the world model is shown them, (T, K·C, 64, 64).
+        truth: The images as the world model is shown them, (T, K·C, S, S).
         reward: The dataset's reward that arrives with frame t + 1, (T,); None where it has no such column.
         reward_key: That column's name.
         by_actions: The dream under each kind of action.

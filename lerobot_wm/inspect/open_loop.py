@@ -86,10 +86,10 @@ def predict(policy: ImaginingPolicy, windows: list[Episode]) -> OpenLoop:
         windows: The first WINDOW frames of episodes of one task.
     """
     world_model, n_cameras = rssm_of(policy), len(policy.config.cameras)
-    images = torch.stack([window.images() for window in windows])  # (B, T, C, 64, 64)
+    images = torch.stack([window.images() for window in windows])  # (B, T, C, S, S)
     actions = torch.stack([window.actions[CONTEXT - 1 : -1] for window in windows])  # (B, T - CONTEXT, A)
     latents = imagine(world_model, filter_episodes(world_model, windows), CONTEXT - 1, actions)
-    imagined = world_model.decode(latents).cpu()  # (B, T - CONTEXT, C, 64, 64)
+    imagined = world_model.decode(latents).cpu()  # (B, T - CONTEXT, C, S, S)
     future, last_seen = images[:, CONTEXT:], images[:, CONTEXT - 1 : CONTEXT]
     return OpenLoop(
         task=windows[0].task,

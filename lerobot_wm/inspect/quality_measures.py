@@ -27,7 +27,7 @@ _PERCENTILES = (5, 25, 50, 75, 95)
 
 
 def mean_and_median_image(episodes: list[Episode]) -> tuple[Tensor, Tensor]:
-    """Two (C, 64, 64) images in [0, 1]: the best constant prediction, and the scene without what moves."""
+    """Two (C, S, S) images in [0, 1]: the best constant prediction, and the scene without what moves."""
     images = torch.cat([episode.images(slice(None, None, _BACKGROUND_STRIDE)) for episode in episodes])
     return images.mean(dim=0), images.median(dim=0).values
 
@@ -45,11 +45,11 @@ def predictions(
         world_model: The model that filtered.
         episodes: E episodes of at least WINDOW frames.
         filtered: Their closed loops.
-        mean_image: (C, 64, 64).
+        mean_image: (C, S, S).
         seed: Seed of the shuffle.
 
     Returns:
-        Each (E, H, C, 64, 64) in [0, 1], on the CPU.
+        Each (E, H, C, S, S) in [0, 1], on the CPU.
     """
     device = world_model.action_scaling.offset.device
     ahead = [CONTEXT - 1 + horizon for horizon in HORIZONS]
@@ -65,8 +65,8 @@ def predictions(
         return world_model.decode(latents).cpu()
 
     latents = torch.stack([loop.latents[ahead] for loop in filtered])  # (E, H, D+S)
-    truth = torch.stack([episode.images(ahead) for episode in episodes])  # (E, H, C, 64, 64)
-    last_seen = torch.stack([episode.images([CONTEXT - 1]) for episode in episodes])  # (E, 1, C, 64, 64)
+    truth = torch.stack([episode.images(ahead) for episode in episodes])  # (E, H, C, S, S)
+    last_seen = torch.stack([episode.images([CONTEXT - 1]) for episode in episodes])  # (E, 1, C, S, S)
     return {
         "truth": truth,
         "open loop": under(actions),
@@ -226,7 +226,7 @@ def drift(
     tables = []
     for episode, loop in zip(episodes, filtered, strict=True):
         steps = min(len(episode), DRIFT_STEPS)
-        truth = episode.images(slice(steps))  # (T, C, 64, 64)
+        truth = episode.images(slice(steps))  # (T, C, S, S)
         restarted = torch.full((steps,), torch.nan)
         if steps >= window_length:
             latents = _restarted_latents(
@@ -266,7 +266,7 @@ def _restarted_latents(
 
 
 def _squared_error(world_model: WorldModel, latents: Tensor, truth: Tensor) -> Tensor:
-    """Mean squared error of each reconstruction, (T, D+S) and (T, C, 64, 64) -> (T,) on the CPU."""
+    """Mean squared error of each reconstruction, (T, D+S) and (T, C, S, S) -> (T,) on the CPU."""
     decoded = world_model.decode(latents.to(world_model.action_scaling.offset.device)).cpu()
     return (decoded - truth).square().mean(dim=(1, 2, 3))
 

@@ -113,7 +113,7 @@ class Replayed:
             self._with_recorded.reset()
 
     def actions(self, frame: dict[str, Any], last_action: Tensor | None) -> dict[str, Tensor]:
-        """The action (A,) for the next frame of the episode, by what the policy's memory was told.
+        """The action (A,) for the next frame of the episode, by what the policy's memory was given.
 
         Args:
             frame: Its features without a batch, and the task.
@@ -210,8 +210,8 @@ def replay(cfg: ReplayConfig) -> Replay:
         truth: list[Tensor] = []
         for _, frame in frames:
             for policy in policies:
-                for told, action in policy.actions(frame, last).items():
-                    chosen.setdefault(f"{policy.name}, {told}", []).append(action)
+                for given, action in policy.actions(frame, last).items():
+                    chosen.setdefault(f"{policy.name}, {given}", []).append(action)
             truth.append(frame[ACTION].float())
             chosen.setdefault(REPEAT, []).append(truth[-1] if last is None else last)
             if has_state:

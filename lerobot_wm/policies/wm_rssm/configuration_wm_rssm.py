@@ -112,7 +112,7 @@ class WMRSSMConfig(WorldModelConfig):
         self.has_reward(dataset_meta)
 
     def fill_from_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
-        """Forget the input sizes, leave out a reward head without reward, and choose what the filter is told."""
+        """Forget the input sizes, leave out a reward head without reward, and choose what the filter gets."""
         rssm = self.rssm
         rssm.action_dim = rssm.image_channels = rssm.proprio_dim = 0
         rssm.predict_reward &= self.has_reward(dataset_meta)
@@ -120,8 +120,8 @@ class WMRSSMConfig(WorldModelConfig):
             rssm.hidden_action_share = _HIDDEN_SHARE if last_action_predicts_next(dataset_meta) else 0.0
             if rssm.hidden_action_share:
                 logger.info(
-                    "Actions hardly change from one frame to the next: the filter is not told them, so that policies "
-                    "do not copy their own last action (--policy.rssm.hidden_action_share=0 tells it)."
+                    "Actions hardly change from one frame to the next: the filter does not get them, so that policies "
+                    "do not copy their own last action (--policy.rssm.hidden_action_share=0 gives them)."
                 )
 
     def validate_features(self) -> None:
