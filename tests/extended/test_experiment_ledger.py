@@ -103,5 +103,6 @@ def test_records_of_another_preset_do_not_count(tmp_path: Path, preset: Preset) 
     records = [record | {"preset": "cpu"} for record in rollouts("wm_bc", 0, preset)]
     file = write(tmp_path / "others.jsonl", records)
     ledger = Ledger(tmp_path / "records.jsonl", file, preset)
-    ledger.add([file])
+    with pytest.raises(ValueError, match=rf"others\.jsonl.*preset {preset.name}"):
+        ledger.add([file])
     assert not ledger.runs
