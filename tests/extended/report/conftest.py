@@ -90,7 +90,7 @@ def episodes_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def world_model_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def untrained_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained wm_rssm checkpoint with small latents."""
     torch.manual_seed(0)
     features = {
@@ -108,11 +108,11 @@ def world_model_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def quality_path(demos_root: Path, world_model_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def quality_path(demos_root: Path, untrained_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The quality.json of the untrained world model on the demonstrations, probed by cross-validation."""
     dataset = SourceConfig("test/demos", str(demos_root))
     folder = tmp_path_factory.mktemp("quality")
-    return quality(QualityConfig(str(world_model_path), dataset, folder, episodes_per_task=3))
+    return quality(QualityConfig(str(untrained_path), dataset, folder, episodes_per_task=3))
 
 
 @pytest.fixture(scope="session")

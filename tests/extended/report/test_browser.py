@@ -67,7 +67,7 @@ def write_hostile_run(folder: Path, records: list[Record]) -> ReportConfig:
 
 @pytest.fixture(scope="module")
 def index(
-    tmp_path_factory: pytest.TempPathFactory, world_model_path: Path, quality_path: Path, replay_path: Path
+    tmp_path_factory: pytest.TempPathFactory, untrained_path: Path, quality_path: Path, replay_path: Path
 ) -> Path:
     """A page with every section."""
     folder = tmp_path_factory.mktemp("browser")
@@ -92,7 +92,7 @@ def index(
     config = write_hostile_run(folder, records)
     config.quality = quality_path
     config.replay = replay_path
-    config.world_model_path = str(world_model_path)
+    config.world_model_path = str(untrained_path)
     config.dataset = SourceConfig("test/recorded", str(folder / "data"))
     return report(config)
 

@@ -78,7 +78,7 @@ def test_records_alone(
 
 def test_a_robot_needs_no_rollouts(
     tmp_path: Path,
-    world_model_path: Path,
+    untrained_path: Path,
     episodes_root: Path,
     replay_path: Path,
     lerobot_wm_command: Callable[..., None],
@@ -86,7 +86,7 @@ def test_a_robot_needs_no_rollouts(
 ) -> None:
     run = write_log(tmp_path / "world_model")
     lerobot_wm_command(
-        f"report --train_logs={run} --replay={replay_path} --world_model_path={world_model_path}",
+        f"report --train_logs={run} --replay={replay_path} --world_model_path={untrained_path}",
         f"--dataset.repo_id=test/episodes --dataset.root={episodes_root} --output_dir={tmp_path}/report",
     )
     assert REPEAT in capsys.readouterr().out
@@ -129,7 +129,7 @@ def write_evaluation(folder: Path, *names: str) -> Path:
     return folder
 
 
-def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, episodes_root: Path) -> None:
+def test_everything(records_file: Path, tmp_path: Path, untrained_path: Path, episodes_root: Path) -> None:
     evaluation = write_evaluation(tmp_path / "eval", "variation_04_failure")
     run = write_log(tmp_path / "world_model")
     index = report(
@@ -138,7 +138,7 @@ def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, 
             output_dir=tmp_path / "report",
             videos=str(evaluation),
             train_logs=str(run),
-            world_model_path=str(world_model_path),
+            world_model_path=str(untrained_path),
             dataset=SourceConfig("test/episodes", str(episodes_root)),
         )
     )
@@ -184,7 +184,7 @@ def test_everything(records_file: Path, tmp_path: Path, world_model_path: Path, 
 def test_episodes_too_short_to_imagine_do_not_cost_the_report(
     records_file: Path,
     tmp_path: Path,
-    world_model_path: Path,
+    untrained_path: Path,
     episodes_root: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -194,7 +194,7 @@ def test_episodes_too_short_to_imagine_do_not_cost_the_report(
         ReportConfig(
             records=str(records_file),
             output_dir=tmp_path / "report",
-            world_model_path=str(world_model_path),
+            world_model_path=str(untrained_path),
             dataset=dataset,
         )
     )
@@ -261,13 +261,13 @@ def test_training_seeds_get_a_table_of_their_own(
 
 
 def test_a_dataset_that_the_model_cannot_read_is_refused(
-    records_file: Path, tmp_path: Path, world_model_path: Path
+    records_file: Path, tmp_path: Path, untrained_path: Path
 ) -> None:
     record_stranger(tmp_path / "stranger")
     config = ReportConfig(
         records=str(records_file),
         output_dir=tmp_path / "report",
-        world_model_path=str(world_model_path),
+        world_model_path=str(untrained_path),
         dataset=SourceConfig("test/recorded", str(tmp_path / "stranger")),
     )
     with pytest.raises(ValueError, match="test/recorded"):

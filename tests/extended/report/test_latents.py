@@ -33,17 +33,17 @@ def source_of(dataset: LeRobotDataset) -> SourceConfig:
 
 
 @pytest.fixture(scope="module")
-def latents(dataset: LeRobotDataset, world_model_path: Path) -> LatentMap:
-    policy = load_world_model(str(world_model_path))
-    policy.world_model = lively_world_model(world_model_path)
+def latents(dataset: LeRobotDataset, untrained_path: Path) -> LatentMap:
+    policy = load_world_model(str(untrained_path))
+    policy.world_model = lively_world_model(untrained_path)
     return latent_map(policy, dataset.meta, source_of(dataset))
 
 
 @torch.no_grad()
 def test_points_are_the_principal_components_of_the_filters_states(
-    latents: LatentMap, dataset: LeRobotDataset, world_model_path: Path
+    latents: LatentMap, dataset: LeRobotDataset, untrained_path: Path
 ) -> None:
-    model = lively_world_model(world_model_path)
+    model = lively_world_model(untrained_path)
     states, start, drawn = [], 0, []
     for length in dataset.meta.episodes["length"][:]:
         state, previous = None, torch.zeros(1, 1, 4)
@@ -77,7 +77,7 @@ def test_each_point_has_its_task_and_its_time(latents: LatentMap, dataset: LeRob
 
 
 def test_episodes_of_several_tasks_are_counted_under_one(
-    dataset: LeRobotDataset, world_model_path: Path, tmp_path: Path
+    dataset: LeRobotDataset, untrained_path: Path, tmp_path: Path
 ) -> None:
     """LeRobot lists an episode's tasks in any order: the first of them need not be that of its first frame."""
     root = shutil.copytree(dataset.root, tmp_path / "copy")
@@ -86,17 +86,17 @@ def test_episodes_of_several_tasks_are_counted_under_one(
     tasks = [["approach", *tasks] for tasks in table["tasks"].to_pylist()]
     pq.write_table(table.set_column(table.column_names.index("tasks"), "tasks", pa.array(tasks)), path)
     copy = LeRobotDataset(dataset.repo_id, root=root)
-    found = latent_map(load_world_model(str(world_model_path)), copy.meta, source_of(copy))
+    found = latent_map(load_world_model(str(untrained_path)), copy.meta, source_of(copy))
     assert found.tasks == ["approach"]
     assert set(found.task.tolist()) == {0}
 
 
 def test_long_episodes_are_read_to_a_bound(
-    dataset: LeRobotDataset, world_model_path: Path, monkeypatch: pytest.MonkeyPatch
+    dataset: LeRobotDataset, untrained_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Whole episodes of ten thousand frames took minutes and gigabytes.
     monkeypatch.setattr("lerobot_wm.inspect.latent_map.MAX_FRAMES", 20)
-    policy = load_world_model(str(world_model_path))
+    policy = load_world_model(str(untrained_path))
     found = latent_map(policy, dataset.meta, source_of(dataset))
     assert found.max_frames == 20
     assert np.bincount(found.task).tolist() == [20 + 6] * 2

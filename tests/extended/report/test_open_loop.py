@@ -35,9 +35,9 @@ def imagined(policy: WMRSSMPolicy | LatentPolicy, repo_id: str, root: Path) -> l
 
 
 @torch.no_grad()
-def test_imagination_follows_the_episodes_actions(world_model_path: Path, episodes_root: Path) -> None:
+def test_imagination_follows_the_episodes_actions(untrained_path: Path, episodes_root: Path) -> None:
     """Equal to one step at a time: frame t is reached by the action executed at frame t - 1."""
-    policy = load_world_model(str(world_model_path))
+    policy = load_world_model(str(untrained_path))
     results = imagined(policy, "test/episodes", episodes_root)
     assert [(result.task, result.n_episodes) for result in results] == [
         ("Reach a goal position", 1),
@@ -63,8 +63,8 @@ def test_imagination_follows_the_episodes_actions(world_model_path: Path, episod
         assert psnr == pytest.approx([-10 * np.log10(all_errors[h - 1]) for h in HORIZONS], abs=1e-3)
 
 
-def test_strips_show_truth_above_imagination(world_model_path: Path, episodes_root: Path) -> None:
-    results = imagined(load_world_model(str(world_model_path)), "test/episodes", episodes_root)
+def test_strips_show_truth_above_imagination(untrained_path: Path, episodes_root: Path) -> None:
+    results = imagined(load_world_model(str(untrained_path)), "test/episodes", episodes_root)
     axes = np.array(strips_figure(results).axes).reshape(2 * len(results), -1)
     shown = axes[2, 3].images[0].get_array()
     np.testing.assert_array_equal(shown, results[1].truth[CONTEXT - 1 + HORIZONS[2]].transpose(1, 2, 0))
@@ -93,8 +93,8 @@ def test_data_without_proprioception(tmp_path: Path, lerobot_wm_command: Callabl
     assert (result.task, result.n_episodes) == ("look", 1)
 
 
-def test_a_policy_that_is_blind_is_refused(world_model_path: Path, tmp_path: Path) -> None:
-    features = PreTrainedConfig.from_pretrained(world_model_path)
+def test_a_policy_that_is_blind_is_refused(untrained_path: Path, tmp_path: Path) -> None:
+    features = PreTrainedConfig.from_pretrained(untrained_path)
     config = WMBCConfig(
         use_latent=False,
         tasks=["Reach a goal position"],
@@ -108,8 +108,8 @@ def test_a_policy_that_is_blind_is_refused(world_model_path: Path, tmp_path: Pat
         load_world_model(str(tmp_path))
 
 
-def test_a_checkpoint_without_a_world_model_is_refused(world_model_path: Path, tmp_path: Path) -> None:
-    features = PreTrainedConfig.from_pretrained(world_model_path)
+def test_a_checkpoint_without_a_world_model_is_refused(untrained_path: Path, tmp_path: Path) -> None:
+    features = PreTrainedConfig.from_pretrained(untrained_path)
     config = ACTConfig(
         input_features=features.input_features,
         output_features=features.output_features,

@@ -84,14 +84,14 @@ def test_by_cross_validation(quality_path: Path, tmp_path: Path) -> None:
 
 def test_fitted_on_the_training_data(
     demos_root: Path,
-    world_model_path: Path,
+    untrained_path: Path,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with caplog.at_level(logging.WARNING):
         quality.quality(
             quality.QualityConfig(
-                str(world_model_path),
+                str(untrained_path),
                 SourceConfig("test/demos", str(demos_root)),
                 tmp_path,
                 SourceConfig("test/demos", str(demos_root)),
@@ -155,25 +155,25 @@ def reach_root(tmp_path_factory: pytest.TempPathFactory, lerobot_wm_command: Cal
 def test_only_tasks_of_both_datasets_are_probed(
     demos_root: Path,
     reach_root: Path,
-    world_model_path: Path,
+    untrained_path: Path,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     reach, demos = SourceConfig("test/reach", str(reach_root)), SourceConfig("test/demos", str(demos_root))
     for judged, trained in ((reach, demos), (demos, reach)):
         with caplog.at_level(logging.WARNING):
-            quality.quality(quality.QualityConfig(str(world_model_path), judged, tmp_path, trained))
+            quality.quality(quality.QualityConfig(str(untrained_path), judged, tmp_path, trained))
         result = json.loads((tmp_path / "quality.json").read_text())
         assert {row["task"] for row in result["probes"]} == {"Reach a goal position", "mean of tasks"}
     assert "No probes of 'Push and close a window'" in caplog.text
 
 
 def test_training_data_of_other_tasks_is_refused(
-    reach_root: Path, world_model_path: Path, tmp_path: Path
+    reach_root: Path, untrained_path: Path, tmp_path: Path
 ) -> None:
     dataset = record(tmp_path / "data", {OBS_IMAGE: camera(64, 64), ACTION: vector(4)}, [("Wave", WINDOW)])
     config = quality.QualityConfig(
-        str(world_model_path),
+        str(untrained_path),
         SourceConfig("test/reach", str(reach_root)),
         tmp_path / "out",
         SourceConfig("test/recorded", str(dataset.root)),
@@ -183,8 +183,8 @@ def test_training_data_of_other_tasks_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_untrained_model_has_other_weights_and_the_same_scaling(world_model_path: Path) -> None:
-    trained = load_world_model(str(world_model_path)).world_model
+def test_the_untrained_model_has_other_weights_and_the_same_scaling(untrained_path: Path) -> None:
+    trained = load_world_model(str(untrained_path)).world_model
     trained.action_scaling.set_range(torch.full((4,), -2.0), torch.full((4,), 2.0))
     before = torch.random.get_rng_state()
     fresh, again, other = (quality.untrained(trained, seed) for seed in (3, 3, 4))

@@ -19,14 +19,14 @@ WINDOW = 20  # frames of a training window: not the default of 25
 
 
 @pytest.fixture(scope="module")
-def world_model(world_model_path: Path) -> WorldModel:
-    return lively_world_model(world_model_path)
+def world_model(untrained_path: Path) -> WorldModel:
+    return lively_world_model(untrained_path)
 
 
 @pytest.fixture(scope="module")
-def episodes(demos_root: Path, world_model_path: Path) -> list[Episode]:
+def episodes(demos_root: Path, untrained_path: Path) -> list[Episode]:
     """An episode of each of the two tasks."""
-    policy = load_world_model(str(world_model_path))
+    policy = load_world_model(str(untrained_path))
     return load_episodes(policy, SourceConfig("test/demos", str(demos_root)), [0, 4])
 
 

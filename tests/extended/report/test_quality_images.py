@@ -25,8 +25,8 @@ from tests.extended.report.quality_model import lively_world_model
 
 
 @pytest.fixture(scope="module")
-def all_episodes(demos_root: Path, world_model_path: Path) -> list[Episode]:
-    policy = load_world_model(str(world_model_path))
+def all_episodes(demos_root: Path, untrained_path: Path) -> list[Episode]:
+    policy = load_world_model(str(untrained_path))
     return load_episodes(policy, SourceConfig("test/demos", str(demos_root)), list(range(8)))
 
 
@@ -72,10 +72,10 @@ def test_what_passes_by_is_in_the_mean_but_not_in_the_median_image(episodes: lis
 
 
 def test_open_loop_is_that_of_the_report(
-    world_model_path: Path, demos_root: Path, episodes: list[Episode]
+    untrained_path: Path, demos_root: Path, episodes: list[Episode]
 ) -> None:
-    policy = load_world_model(str(world_model_path))
-    policy.world_model = lively_world_model(world_model_path)
+    policy = load_world_model(str(untrained_path))
+    policy.world_model = lively_world_model(untrained_path)
     one_task = [episode for episode in episodes if episode.task == episodes[-1].task]
     assert len(one_task) > 1
     filtered = filter_episodes(policy.world_model, one_task)
@@ -97,8 +97,8 @@ def test_open_loop_is_that_of_the_report(
         )
 
 
-def test_shuffled_actions_are_another_episodes(world_model_path: Path, episodes: list[Episode]) -> None:
-    world_model = lively_world_model(world_model_path)
+def test_shuffled_actions_are_another_episodes(untrained_path: Path, episodes: list[Episode]) -> None:
+    world_model = lively_world_model(untrained_path)
     two = [episodes[0], episodes[-1]]
     filtered = filter_episodes(world_model, two)
     mean, _ = mean_and_median_image(two)
@@ -115,10 +115,8 @@ def test_shuffled_actions_are_another_episodes(world_model_path: Path, episodes:
 
 
 @torch.no_grad()
-def test_filtering_in_batches_is_filtering_one_by_one(
-    world_model_path: Path, episodes: list[Episode]
-) -> None:
-    world_model = lively_world_model(world_model_path)
+def test_filtering_in_batches_is_filtering_one_by_one(untrained_path: Path, episodes: list[Episode]) -> None:
+    world_model = lively_world_model(untrained_path)
     assert len({len(episode) for episode in episodes}) > 1, "or nothing is padded"
     for episode, loop in zip(episodes, filter_episodes(world_model, episodes), strict=True):
         states = world_model.filter(episode.images()[None], episode.actions[None])
@@ -148,10 +146,10 @@ def test_positions_tell_variations_apart(all_episodes: list[Episode]) -> None:
 
 
 def test_a_dataset_without_positions_has_its_vectors_as_targets(
-    episodes_root: Path, world_model_path: Path
+    episodes_root: Path, untrained_path: Path
 ) -> None:
     source = SourceConfig("test/episodes", str(episodes_root))
-    episodes = load_episodes(load_world_model(str(world_model_path)), source, [0, 3])
+    episodes = load_episodes(load_world_model(str(untrained_path)), source, [0, 3])
     for episode in episodes:
         assert list(probe_targets(episode)) == [OBS_STATE]
         assert probe_targets(episode)[OBS_STATE].shape == episode.actions.shape

@@ -141,8 +141,8 @@ def test_one_task_needs_no_probe(frames: Frames) -> None:
     assert probe_task(first) == []
 
 
-def test_frames_of_real_episodes(demos_root: Path, world_model_path: Path) -> None:
-    policy = load_world_model(str(world_model_path))
+def test_frames_of_real_episodes(demos_root: Path, untrained_path: Path) -> None:
+    policy = load_world_model(str(untrained_path))
     world_model = policy.world_model
     episodes = load_episodes(policy, SourceConfig("test/demos", str(demos_root)), [0, 1, 4, 5])
     filtered = filter_episodes(world_model, episodes)
