@@ -63,28 +63,39 @@ def frame_values(meta: LeRobotDatasetMetadata, key: str) -> Tensor:
     """
     shape = tuple(meta.features[key]["shape"])
     numbers = torch.zeros(meta.total_frames, *(() if shape == (1,) else shape))
-    paths = _tables(meta)
-    if not paths:
-        raise FileNotFoundError(
-            f"{Path(meta.root) / 'data'} has no tables to read {key} from: train without --dataset.streaming=true, or "
-            f"download {meta.repo_id} to that folder first."
-        )
-    for path in paths:
-        table = pq.read_table(path, columns=list({"index", key}))
-        index, values = (
-            np.concatenate([_flat_values(chunk) for chunk in table[name].chunks]) for name in ("index", key)
-        )
-        numbers[torch.from_numpy(index)] = torch.from_numpy(values.astype(np.float32)).view(
-            -1, *numbers.shape[1:]
-        )
+    index, values = _read_columns(meta, key)
+    numbers[torch.from_numpy(index)] = torch.from_numpy(values.astype(np.float32)).view(
+        -1, *numbers.shape[1:]
+    )
     return numbers
 
 
 def frames_on_disk(meta: LeRobotDatasetMetadata, *keys: str) -> list[Tensor]:
-    """Numeric columns of the frames that are on this machine, in their order: (N, size) float32 each."""
-    index = frame_values(meta, "index").long()
-    here = index == torch.arange(meta.total_frames)  # zero elsewhere
-    return [frame_values(meta, key).view(meta.total_frames, -1)[here] for key in keys]
+    """Read numeric columns of the frames that are on this machine, in their order.
+
+    Returns:
+        (N, size) float32 of each column.
+
+    Raises:
+        FileNotFoundError: No table is on this machine.
+    """
+    index, *columns = _read_columns(meta, *keys)
+    return [torch.from_numpy(values.astype(np.float32)).view(len(index), -1) for values in columns]
+
+
+def _read_columns(meta: LeRobotDatasetMetadata, *keys: str) -> list[np.ndarray]:
+    """The index (N,) of the frames on this machine, and the numbers (N * size,) in each column; reads a table once."""
+    names = ("index", *keys)
+    tables = [pq.read_table(path, columns=list(names)) for path in _tables(meta)]
+    if not tables:
+        raise FileNotFoundError(
+            f"{Path(meta.root) / 'data'} has no tables to read {', '.join(keys)} from: train without "
+            f"--dataset.streaming=true, or download {meta.repo_id} to that folder first."
+        )
+    return [
+        np.concatenate([_flat_values(chunk) for table in tables for chunk in table[name].chunks])
+        for name in names
+    ]
 
 
 def _tables(meta: LeRobotDatasetMetadata) -> list[Path]:

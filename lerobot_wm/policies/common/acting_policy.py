@@ -95,7 +95,7 @@ class ActingPolicy(BasePolicy):
             *(self.action_scaling.inverse(end).cpu() for end in ends),
         )
         # (A,) each, on the CPU; of chunks the first step.
-        low, high, lowest, highest = (ends.view(-1, self.config.action_dim)[0] for ends in ranges)
+        low, high, lowest, highest = (each.view(-1, self.config.action_dim)[0] for each in ranges)
         tolerance = _RANGE_TOLERANCE * (high - low)
         outside = (low < lowest - tolerance) | (high > highest + tolerance)
         for i in torch.nonzero(outside).flatten().tolist():
