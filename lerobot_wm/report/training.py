@@ -143,17 +143,8 @@ def _picture(image: Tensor) -> str:
     return data_uri(buffer.getvalue(), WEBP)
 
 
-# LeRobot's counters and timings, which say nothing about learning.
-BOOKKEEPING = {
-    "steps",
-    "samples",
-    "episodes",
-    "epochs",
-    "update_s",
-    "dataloading_s",
-    "samples_per_s",
-    "gpu_mem_gb",
-}
+# LeRobot's counters, which say nothing about learning; nor do its timings, whose names end in _s.
+BOOKKEEPING = {"steps", "samples", "episodes", "epochs", "gpu_mem_gb"}
 # One run's values by name: (step, value) each.
 Curves = dict[str, list[tuple[int, float]]]
 COLOURS = colormaps["tab20"].colors  # type: ignore[attr-defined]  # a ListedColormap
@@ -188,7 +179,8 @@ def read_curves(run: Path) -> Curves:
         entry = json.loads(line)
         step = entry.pop("step")
         for name in entry.keys() - BOOKKEEPING:
-            curves.setdefault(name, []).append((step, entry[name]))
+            if not name.endswith("_s"):
+                curves.setdefault(name, []).append((step, entry[name]))
     # A resumed run logs some steps again: the last value counts.
     return {name: sorted(dict(points).items()) for name, points in curves.items()}
 

@@ -11,7 +11,8 @@ from lerobot_wm.report.training import curve_figures, read_logs
 
 def write_log(run: Path, **values: float) -> Path:
     run.mkdir(parents=True)
-    lines = [{"step": step, "update_s": 0.1} | values for step in (100, 200)]
+    timings = {"update_s": 0.1, "preprocessing_s": 0.1, "step_s": 0.2, "samples_per_s": 50}
+    lines = [{"step": step} | timings | values for step in (100, 200)]
     (run / "train_log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return run
 
