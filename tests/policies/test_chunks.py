@@ -154,11 +154,20 @@ def test_end_to_end_policies_predict_chunks_too(
     demos: LeRobotDataset, lerobot_wm_command: Callable[..., None], tmp_path: Path
 ) -> None:
     lerobot_wm_command(
-        f"train --policy.type=e2e_bc --policy.chunk_size={CHUNK} --policy.head=flow --steps=2 --batch_size=4",
+        f"train --policy.type=e2e_bc --policy.chunk_size={CHUNK} --policy.n_action_steps=3 --policy.head=flow",
+        "--steps=2 --batch_size=4",
         train_flags(demos),
         f"--output_dir={tmp_path / 'run'}",
     )
     policy = E2EBCPolicy.from_pretrained(tmp_path / "run" / "checkpoints" / "last" / "pretrained_model")
     frame = demos[0]
-    batch: dict[str, Tensor] = {key: frame[key][None] for key in ("observation.image", "observation.state")}
-    assert policy.predict_action_chunk({**batch, "task": [frame["task"]]}).shape == (1, CHUNK, 4)
+    batch: dict[str, Any] = {key: frame[key][None] for key in ("observation.image", "observation.state")}
+    batch["task"] = [frame["task"]]
+    assert policy.predict_action_chunk(batch).shape == (1, CHUNK, 4)
+
+    encoded: list[Tensor] = []
+    policy.encoder.register_forward_hook(lambda _module, _inputs, features: encoded.append(features))
+    policy.reset()
+    for _ in range(6):
+        policy.select_action(batch)
+    assert len(encoded) == 2, "images are encoded only where actions are predicted"

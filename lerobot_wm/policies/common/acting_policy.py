@@ -2,7 +2,7 @@
 
 import logging
 from collections import deque
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -31,6 +31,7 @@ class ActingPolicy(BasePolicy):
     """
 
     config: ActingConfig
+    has_memory: ClassVar[bool] = False  # whether it must read every frame, also those between two predictions
 
     def build(self) -> None:
         """Make the scalings."""
@@ -199,8 +200,10 @@ class ActingPolicy(BasePolicy):
         Raises:
             ValueError: A camera or a state is missing or has another size than in training, or the task is unknown.
         """
-        observation, state = self._observe(batch)
-        if not self._actions or len(self._actions[0]) != len(observation):
+        has_next = self._actions and len(self._actions[0]) == self.batch_size(batch)
+        if self.has_memory or not has_next:
+            observation, state = self._observe(batch)
+        if not has_next:
             self._actions = deque(self._chunk(observation, state, batch)[:, : self.n_action_steps].unbind(1))
         action = self._actions.popleft()
         self.executed(action)

@@ -30,6 +30,7 @@ class LatentPolicy(ActingPolicy):
     """
 
     config: LatentPolicyConfig
+    has_memory = True  # the filter's
     world_model: LatentModel  # with `use_latent`
 
     def build(self) -> None:
