@@ -1,3 +1,5 @@
+"""Noise on actions at test time, and on proprioception in training."""
+
 from pathlib import Path
 from typing import Any
 
@@ -5,7 +7,7 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.factory import get_policy_class
+from lerobot.policies.factory import get_policy_class, make_policy
 from torch import Tensor
 
 from lerobot_wm.policies.common.acting_policy import ActingPolicy
@@ -76,6 +78,28 @@ def test_policies_act_with_noise_within_the_dataset_s_range(
     )
 
 
-def test_negative_noise_is_refused() -> None:
-    with pytest.raises(ValueError, match="0 or more"):
-        get_policy_class("wm_bc").config_class(action_noise=-0.1)
+@pytest.mark.parametrize("policy_type", ["wm_bc", "e2e_bc"])
+def test_proprioception_has_noise_in_training_alone(demos: LeRobotDataset, policy_type: str) -> None:
+    blind = {"use_latent": False} if policy_type == "wm_bc" else {}
+    config = get_policy_class(policy_type).config_class(device="cpu", state_noise=STD, **blind)
+    policy = make_policy(config, ds_meta=demos.meta)
+    batch = {key: demos[0][key].expand(500, *demos[0][key].shape) for key in config.input_features}
+    batch["task"] = [demos[0]["task"]] * 500
+
+    def observation() -> Tensor:  # as in training, with tasks before proprioception
+        state, tasks = policy.state_at(batch), policy.one_hot_tasks(batch, 500)
+        inputs = (policy.images(batch), state, tasks) if policy_type == "e2e_bc" else (state, tasks, None)
+        return policy.observation(*inputs)
+
+    policy.eval()
+    exact = observation()
+    policy.train()
+    noise = observation() - exact  # (500, O)
+    assert noise[:, -4:].std(0).tolist() == pytest.approx([STD] * 4, rel=0.15)
+    assert not noise[:, :-4].any()
+
+
+@pytest.mark.parametrize("setting", ["action_noise", "state_noise"])
+def test_negative_noise_is_refused(setting: str) -> None:
+    with pytest.raises(ValueError, match=rf"{setting}=-0.1.*0 or more"):
+        get_policy_class("wm_bc").config_class(**{setting: -0.1})

@@ -22,6 +22,9 @@ class ActingConfig(PolicyConfig):
     Args:
         hidden_dims: Widths of the hidden layers of every head.
         dropout: Dropout of the actor.
+        state_noise: Standard deviation of Gaussian noise on proprioception in training, in standard deviations of the
+            dataset's. From few episodes, a policy can learn which action follows which exact position of the joints,
+            and need no image. Where the task needs the exact position, noise hurts.
         action_noise: Standard deviation of Gaussian noise on the actions at test time, in units in which the actions
             that the heads learn span [-1, 1]. It frees a policy that hovers in a place where no demonstration ends.
         relative_actions: Learn targets relative to the state: the heads learn a_t minus the measured state where the
@@ -35,6 +38,7 @@ class ActingConfig(PolicyConfig):
 
     hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
     dropout: float = 0.1
+    state_noise: float = 0.0
     action_noise: float = 0.0
     relative_actions: bool | None = None
     tasks: list[str] = field(default_factory=list)
@@ -43,10 +47,11 @@ class ActingConfig(PolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.action_noise < 0:
-            raise ValueError(
-                f"--policy.action_noise={self.action_noise:g}: a standard deviation is 0 or more."
-            )
+        for name in ("action_noise", "state_noise"):
+            if getattr(self, name) < 0:
+                raise ValueError(
+                    f"--policy.{name}={getattr(self, name):g}: a standard deviation is 0 or more."
+                )
 
     @property
     def action_dim(self) -> int:

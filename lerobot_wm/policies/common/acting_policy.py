@@ -70,6 +70,13 @@ class ActingPolicy(BasePolicy):
         state = join_vectors(frames, self.config.state_vectors)
         return self.state_scaling.offset.new_zeros(self.batch_size(batch), 0) if state is None else state
 
+    def proprioception(self, state: Tensor) -> Tensor:
+        """What the heads read of proprioception (B, P): scaled, and in training with `state_noise`."""
+        scaled = self.state_scaling(state)
+        if self.training and self.config.state_noise > 0:
+            scaled = scaled + self.config.state_noise * torch.randn_like(scaled)
+        return scaled
+
     def batch_size(self, batch: dict[str, Any]) -> int:
         """B of a batch, in training or at test time."""
         keys = (*self.config.input_features, ACTION)

@@ -49,7 +49,7 @@ class E2EPolicy(ActingPolicy):
         """
         if self.training and self.config.random_crop_pad:
             images = random_crop(images, self.config.random_crop_pad)
-        return torch.cat([self.encoder(images), tasks, self.state_scaling(state)], dim=-1)
+        return torch.cat([self.encoder(images), tasks, self.proprioception(state)], dim=-1)
 
     def observe(self, batch: dict[str, Any], state: Tensor) -> Tensor:
         """Encode the new image; join its features, the one-hot task and proprioception: (B, O)."""

@@ -116,7 +116,7 @@ class LatentPolicy(ActingPolicy):
         Returns:
             [latent, one-hot task, scaled proprioception, scaled full state], (B, O).
         """
-        inputs = [tasks, self.state_scaling(state)]
+        inputs = [tasks, self.proprioception(state)]
         if latent is not None:
             inputs.insert(0, self.latent_scaling(latent) if self.config.scales_latents else latent)
         if env_state is not None:

@@ -1,0 +1,301 @@
+"""Our policy beside ACT and Diffusion Policy: the same demonstrations, the same training time, the same starts.
+
+    python -m benchmarks.policies --task=pusht --root=data/pusht_human --minutes=30
+
+The demonstrations of PushT are made by examples/pusht_human.py, those of ALOHA by examples/record_env.py, those of MT10
+by `lerobot-wm collect`. A short run of each training tells how long it takes to start and how long a step takes, and so
+how many steps fit into the time. Everything is written to outputs/policies/<task>, where a repeated command goes on.
+Diffusion Policy needs `pip install 'diffusers>=0.38,<0.40'`.
+"""
+
+import argparse
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.environments import ROOT
+from benchmarks.measure import THREAD_VARIABLES
+from lerobot_wm.files import write_whole
+from lerobot_wm.records import RNG_SEED, SuccessRate, percentile_interval, provenance, resample
+from lerobot_wm.system import usable_cores
+
+PILOT_STEPS = 20
+LATENCY_FRAMES = 100
+REPO_ID = "benchmark/demonstrations"
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training command.
+
+    Attributes:
+        flags: Of LeRobot's training, without data, steps, seed and output. {previous} is the training before it.
+        share: Of the time that the policy may take.
+        program: What is run.
+    """
+
+    flags: str
+    share: float = 1.0
+    program: str = "lerobot-wm train"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is learned.
+
+    Attributes:
+        evaluation: Flags of lerobot-eval.
+        trainings: By policy: its trainings, the last of which gives the policy.
+    """
+
+    evaluation: str
+    trainings: dict[str, list[Training]]
+
+
+def ours(share: float, world_model: str, policy: str) -> list[Training]:
+    """A world model, and wm_bc on it; `share` of the time goes into the world model."""
+    return [
+        Training(f"--policy.type=wm_rssm --batch_size=16 {world_model}", share),
+        Training(
+            f"--policy.type=wm_bc --policy.world_model_path={{previous}} --batch_size=256 {policy}", 1 - share
+        ),
+    ]
+
+
+WORLD_MODEL = (
+    "--policy.rssm.standardize_images=true --policy.rssm.decode_share=0.2 --policy.rssm.kl_scale=0.3"
+)
+CHUNKS = (
+    "--policy.head=flow --policy.chunk_size=16 --policy.n_action_steps=8 --policy.hidden_dims='[512,512,512]'"
+)
+# ImageNet's weights come from the network, and Diffusion Policy on PushT was published without them.
+SCRATCH = "--policy.pretrained_backbone_weights=null"
+ACT = [Training(f"--policy.type=act --batch_size=8 {SCRATCH}", program="lerobot-train")]
+DIFFUSION = [
+    Training(
+        f"--policy.type=diffusion --batch_size=64 --policy.horizon=16 --policy.n_action_steps=8 {SCRATCH} "
+        "--policy.use_group_norm=true --policy.crop_ratio=0.875",
+        program="lerobot-train",
+    )
+]
+TASKS = {
+    "pusht": Task(
+        "--env.type=pusht --eval.batch_size=25",
+        {
+            "wm_bc": ours(0.5, f"{WORLD_MODEL} --policy.rssm.action_scale=2000", CHUNKS),
+            "act": ACT,
+            "diffusion": DIFFUSION,
+        },
+    ),
+    "aloha": Task(
+        "--env.type=aloha --env.task=AlohaTransferCube-v0 --eval.batch_size=1",
+        {
+            "wm_bc": ours(0.8, f"{WORLD_MODEL} --policy.rssm.action_scale=2000", CHUNKS),
+            "act": ACT,
+            "diffusion": DIFFUSION,
+        },
+    ),
+    "mt10": Task(
+        "--env.type=metaworld_mt --env.task=mt10 --eval.batch_size=5",
+        {"wm_bc": ours(0.8, WORLD_MODEL, ""), "act": ACT, "diffusion": DIFFUSION},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a command needed.
+
+    Attributes:
+        command: As it was typed.
+        seconds: It took.
+        memory_gb: The highest sum of its processes' memory.
+        output: What it printed.
+    """
+
+    command: str
+    seconds: float
+    memory_gb: float
+    output: str
+
+
+def run(command: str, threads: int, log: Path) -> Run:
+    """Run a command of this environment.
+
+    Raises:
+        RuntimeError: It failed. Contains the end of what it printed.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    program, *arguments = shlex.split(command)
+    start, peak = time.monotonic(), 0
+    variables = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
+    with log.open("w") as file:
+        process = psutil.Popen(
+            [str(Path(sys.executable).parent / program), *arguments],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=variables,
+        )
+        while process.poll() is None:
+            peak = max(peak, _memory(process))
+            time.sleep(0.5)
+    output = log.read_text()
+    if process.returncode:
+        raise RuntimeError(f"`{command}` failed:\n{output[-2000:]}")
+    return Run(command, time.monotonic() - start, peak / 1e9, output)
+
+
+def _memory(process: psutil.Process) -> int:
+    try:
+        return sum(each.memory_info().rss for each in (process, *process.children(recursive=True)))
+    except psutil.NoSuchProcess:  # one has just ended
+        return 0
+
+
+def step_seconds(output: str) -> float:
+    """How long a step takes, from the last line that LeRobot's training logged: its update and its data."""
+    update, data = re.findall(r"updt_s:([\d.]+).*? data_s:([\d.]+)", output)[-1]
+    return float(update) + float(data)
+
+
+def train(training: Training, flags: str, minutes: float, threads: int, folder: Path) -> Run:
+    """Train for about so many minutes, including the start and what comes before the first step."""
+    command = f"{training.program} {training.flags} {flags}"
+    pilot = run(
+        f"{command} --steps={PILOT_STEPS} --log_freq={PILOT_STEPS // 2} --save_checkpoint=false "
+        f"--output_dir={folder}_pilot",
+        threads,
+        folder.with_name(f"{folder.name}_pilot.log"),
+    )
+    step = step_seconds(pilot.output)
+    begin = pilot.seconds - PILOT_STEPS * step
+    steps = max(1, int((60 * minutes - begin) / step))
+    print(f"{folder.name}: {begin:.0f} s to start, {step:.3f} s a step: {steps} steps", flush=True)
+    return run(
+        f"{command} --steps={steps} --save_freq={steps} --output_dir={folder}",
+        threads,
+        folder.with_name(f"{folder.name}.log"),
+    )
+
+
+def latency(checkpoint: Path, root: Path) -> dict[str, float]:
+    """The mean and the longest time of a decision in ms, on one thread, over the first frames of the dataset."""
+    torch.set_num_threads(1)
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.device = "cpu"
+    policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+    before, _ = make_pre_post_processors(config, str(checkpoint))
+    dataset = LeRobotDataset(REPO_ID, root)
+    times = []
+    policy.reset()
+    for index in range(LATENCY_FRAMES):
+        frame = {
+            key: value for key, value in dataset[index].items() if key in (*config.input_features, "task")
+        }
+        begin = time.perf_counter()
+        with torch.inference_mode():
+            policy.select_action(before(frame))
+        times.append(1000 * (time.perf_counter() - begin))
+    return {"mean": float(np.mean(times[1:])), "longest": float(np.max(times[1:]))}
+
+
+def measure(task: Task, policy: str, arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Train and evaluate one policy."""
+    flags = f"--dataset.repo_id={REPO_ID} --dataset.root={arguments.root} --seed={arguments.seed}"
+    flags += " --policy.push_to_hub=false --policy.device=cpu"
+    runs, previous = [], Path()
+    for number, training in enumerate(task.trainings[policy]):
+        output = folder / f"{policy}_{number}"
+        filled = Training(training.flags.format(previous=previous), training.share, training.program)
+        runs.append(train(filled, flags, arguments.minutes * training.share, arguments.threads, output))
+        previous = output / "checkpoints" / "last" / "pretrained_model"
+    evaluation = folder / f"{policy}_eval"
+    run(
+        f"lerobot-eval --policy.path={previous} --policy.device=cpu {task.evaluation} --eval.use_async_envs=false "
+        f"--eval.n_episodes={arguments.episodes} --seed={arguments.first_start} --output_dir={evaluation}",
+        arguments.threads,
+        folder / f"{policy}_eval.log",
+    )
+    infos = json.loads((evaluation / "eval_info.json").read_text())["per_task"]
+    return {
+        "policy": policy,
+        "trainings": [
+            {key: value for key, value in asdict(each).items() if key != "output"} for each in runs
+        ],
+        "minutes": sum(each.seconds for each in runs) / 60,
+        "memory_gb": max(each.memory_gb for each in runs),
+        "latency_ms": latency(previous, arguments.root),
+        "successes": [bool(each) for info in infos for each in info["metrics"]["successes"]],
+        "max_rewards": [float(each) for info in infos for each in info["metrics"]["max_rewards"]],
+    }
+
+
+def difference(ours: list[bool], other: list[bool]) -> str:
+    """Success of ours minus another's in points, with its 95% interval over the starts."""
+    each = 100 * (np.array(ours, dtype=float) - np.array(other, dtype=float))  # (episodes,)
+    low, high = percentile_interval(resample(each, np.random.default_rng(RNG_SEED)).mean(axis=1))
+    return f"{each.mean():+.0f} [{low:+.0f}, {high:+.0f}]"
+
+
+def results_table(rows: list[dict[str, Any]]) -> Table:
+    """One line per policy; the first is ours."""
+    table = Table("policy", "success", "ours minus it", "best reward", "training", "memory", "decision")
+    for row in rows:
+        successes = row["successes"]
+        table.add_row(
+            row["policy"],
+            str(SuccessRate(sum(successes), len(successes))),
+            "" if row is rows[0] else difference(rows[0]["successes"], successes),
+            f"{np.mean(row['max_rewards']):.3f}",
+            f"{row['minutes']:.0f} min",
+            f"{row['memory_gb']:.1f} GB",
+            f"{row['latency_ms']['mean']:.1f} ms, at most {row['latency_ms']['longest']:.0f}",
+        )
+    return table
+
+
+def main() -> None:
+    """Measure all policies of one task."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--task", choices=TASKS, required=True)
+    parser.add_argument("--root", type=Path, required=True, help="folder of the demonstrations")
+    parser.add_argument("--minutes", type=float, default=30, help="of training, for each policy")
+    parser.add_argument("--policies", default="wm_bc,act,diffusion", help="names, separated by commas")
+    parser.add_argument("--episodes", type=int, default=50, help="of evaluation")
+    parser.add_argument("--first_start", type=int, default=1000, help="seed of the first evaluated start")
+    parser.add_argument("--seed", type=int, default=0, help="of training")
+    parser.add_argument("--threads", type=int, default=usable_cores(), help="of every command")
+    parser.add_argument("--output_dir", type=Path, help="default: outputs/policies/<task>")
+    arguments = parser.parse_args()
+    task = TASKS[arguments.task]
+    folder = arguments.output_dir or ROOT / "outputs" / "policies" / arguments.task
+    rows = []
+    for policy in arguments.policies.split(","):
+        path = folder / f"{policy}.json"
+        if not path.exists():
+            row = {"provenance": provenance(), **measure(task, policy, arguments, folder)}
+            write_whole(path, json.dumps(row, indent=2) + "\n")
+        rows.append(json.loads(path.read_text()))
+    Console().print(results_table(rows))
+
+
+if __name__ == "__main__":
+    main()
