@@ -52,7 +52,9 @@ def main() -> None:
     for end in tqdm(arrays["episode_ends"], unit="episode"):
         corners, coverage = [], []
         for frame in range(begin, end):
-            env._set_state(state[frame].astype(float))
+            # The angle first: it turns the block about its centre of mass, and so moves it.
+            env.block.angle = float(state[frame, 4])
+            env.block.position = tuple(state[frame, 2:4].astype(float))
             corners.append(env.get_obs()["environment_state"].astype(np.float32))
             coverage.append(env._get_coverage())
         # A demonstration ends when the person was satisfied; the state after its last action was not recorded.

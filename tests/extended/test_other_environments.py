@@ -192,3 +192,27 @@ def test_what_cannot_be_recorded_is_refused(
 ) -> None:
     with pytest.raises(error, match=message):
         run_example("examples/record_env.py", *flags.split(), "--repo_id=test/x", f"--root={tmp_path}")
+
+
+def test_peoples_pusht_demonstrations_are_converted(run_example: Callable[..., None], tmp_path: Path) -> None:
+    needs("gym_pusht")
+    place, angles = np.array([200.0, 300.0]), [0.0, np.pi, np.pi, 0.5]
+    state = np.array([[100, 100, *place, angle] for angle in angles], dtype=np.float32)
+    image = np.random.default_rng(0).integers(0, 256, (4, 96, 96, 3), dtype=np.uint8)
+    action, ends = np.full((4, 2), 120, dtype=np.float32), np.array([3, 4])
+    np.savez(tmp_path / "file.npz", image=image, state=state, action=action, episode_ends=ends)
+    root = tmp_path / "dataset"
+    run_example(
+        "examples/pusht_human.py",
+        f"--file={tmp_path / 'file.npz'}",
+        "--repo_id=test/people",
+        f"--root={root}",
+    )
+    dataset = LeRobotDataset("test/people", root)
+    assert dataset.num_episodes == 2
+    corners = [dataset[t]["observation.environment_state"].numpy().reshape(8, 2) for t in range(4)]
+    # Turned by half a turn about its place, whatever the frame before; and 0.5 radians turn lengths alone.
+    np.testing.assert_allclose(corners[0] - place, place - corners[1], atol=1e-3)
+    np.testing.assert_allclose(corners[2], corners[1], atol=1e-3)
+    lengths = [np.linalg.norm(each - place, axis=1) for each in (corners[0], corners[3])]
+    np.testing.assert_allclose(*lengths, atol=1e-3)
