@@ -23,9 +23,11 @@ from typing import Any
 import numpy as np
 import psutil
 import torch
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from rich.console import Console
 from rich.table import Table
 
@@ -215,15 +217,27 @@ def latency(checkpoint: Path, root: Path) -> dict[str, float]:
     return {"mean": float(np.mean(times[1:])), "longest": float(np.max(times[1:]))}
 
 
+def inputs(root: Path) -> dict[str, Any]:
+    """What a policy may read: cameras and proprioception. LeRobot's would read the simulator's full state too."""
+    features = dataset_to_policy_features(LeRobotDatasetMetadata(REPO_ID, root).features)
+    return {
+        key: {"type": feature.type.name, "shape": list(feature.shape)}
+        for key, feature in features.items()
+        if feature.type in (FeatureType.VISUAL, FeatureType.STATE)
+    }
+
+
 def measure(task: Task, policy: str, arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Train and evaluate one policy."""
     flags = f"--dataset.repo_id={REPO_ID} --dataset.root={arguments.root} --seed={arguments.seed}"
     flags += " --policy.push_to_hub=false --policy.device=cpu"
+    peers = f" --policy.input_features={shlex.quote(json.dumps(inputs(arguments.root)))}"
     runs, previous = [], Path()
     for number, training in enumerate(task.trainings[policy]):
         output = folder / f"{policy}_{number}"
         filled = Training(training.flags.format(previous=previous), training.share, training.program)
-        runs.append(train(filled, flags, arguments.minutes * training.share, arguments.threads, output))
+        own = flags if training.program == "lerobot-wm train" else flags + peers
+        runs.append(train(filled, own, arguments.minutes * training.share, arguments.threads, output))
         previous = output / "checkpoints" / "last" / "pretrained_model"
     evaluation = folder / f"{policy}_eval"
     run(
