@@ -4,7 +4,8 @@
 
 The demonstrations of PushT are made by examples/pusht_human.py, those of ALOHA by examples/record_env.py, those of MT10
 by `lerobot-wm collect`. A short run of each training tells how long it takes to start and how long a step takes, and so
-how many steps fit into the time. Everything is written to outputs/policies/<task>, where a repeated command goes on.
+how many steps fit into the time. Everything is written to outputs/policies/<task>; a repeated command keeps policies
+that are done.
 Diffusion Policy needs `pip install 'diffusers>=0.38,<0.40'`.
 """
 
@@ -27,13 +28,13 @@ from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.utils.feature_utils import dataset_to_policy_features
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.environments import ROOT
 from benchmarks.measure import THREAD_VARIABLES
 from lerobot_wm.files import write_whole
+from lerobot_wm.policies.common.features import policy_features
 from lerobot_wm.records import RNG_SEED, SuccessRate, percentile_interval, provenance, resample
 from lerobot_wm.system import usable_cores
 
@@ -219,7 +220,7 @@ def latency(checkpoint: Path, root: Path) -> dict[str, float]:
 
 def inputs(root: Path) -> dict[str, Any]:
     """What a policy may read: cameras and proprioception. LeRobot's would read the simulator's full state too."""
-    features = dataset_to_policy_features(LeRobotDatasetMetadata(REPO_ID, root).features)
+    features = policy_features(LeRobotDatasetMetadata(REPO_ID, root))
     return {
         key: {"type": feature.type.name, "shape": list(feature.shape)}
         for key, feature in features.items()
