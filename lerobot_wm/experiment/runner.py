@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import IO
 
 from rich.console import Console, Group
@@ -39,9 +40,14 @@ class Times:
         write_whole(self._path, json.dumps(self._measured, indent=1) + "\n")
 
     def minutes(self, kind: str) -> float:
-        """How long a stage of this kind takes: the mean of those measured, else what the preset says."""
+        """How long a stage of this kind takes: the mean of those measured, else what the preset says.
+
+        Other kinds, of arms that the preset leaves out, are taken to be as long as its mean one.
+        """
         seconds = [entry["seconds"] for entry in self._measured.values() if entry["kind"] == kind]
-        return sum(seconds) / len(seconds) / 60 if seconds else self._expected[kind]
+        if seconds:
+            return fmean(seconds) / 60
+        return self._expected.get(kind, fmean(self._expected.values()))
 
 
 def ranks(stages: Mapping[str, Stage], minutes: Mapping[str, float]) -> dict[str, float]:

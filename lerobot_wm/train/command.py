@@ -83,7 +83,11 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
     if not isinstance(policy, PolicyConfig):
         return
     check_fit(policy, meta, cfg.rename_map)
-    if not isinstance(policy, LatentPolicyConfig) or not policy.use_latent or OBS_LATENT in meta.features:
+    if (
+        not isinstance(policy, LatentPolicyConfig)
+        or not policy.reads_stored_latents
+        or OBS_LATENT in meta.features
+    ):
         return
     if policy.pretrained_path is None:
         check_new_policy(policy, meta, cfg)

@@ -176,6 +176,11 @@ def test_measured_minutes_replace_the_stated_ones(tmp_path: Path) -> None:
     assert Times(tmp_path / "times.json", {"kind": 7.0}).minutes("kind") == 2.0
 
 
+def test_arms_that_a_preset_does_not_name_take_as_long_as_its_others(tmp_path: Path) -> None:
+    times = Times(tmp_path / "times.json", {"kind": 7.0, "other": 1.0})
+    assert times.minutes("further") == 4.0
+
+
 # A run of two long stages, as a program of its own: `python -c RUN FOLDER`.
 RUN = """
 import signal, sys

@@ -82,11 +82,6 @@ class ActingPolicy(BasePolicy):
         keys = (*self.config.input_features, ACTION)
         return next(len(batch[key]) for key in keys if isinstance(batch.get(key), Tensor))
 
-    def scaled_actions(self, batch: dict[str, Any]) -> Tensor:
-        """A training batch's actions (B, A), or chunks (B, K, A), as the heads learn them."""
-        has_windows = self.config.observation_delta_indices is not None  # frames t and t+1
-        return self.scaled(batch[ACTION], self.state_at(batch, 0 if has_windows else None))
-
     def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Also learn the dataset's new tasks."""
         super().continue_training(dataset_meta)

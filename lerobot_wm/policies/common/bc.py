@@ -99,7 +99,8 @@ class BCPolicy(ActingPolicy):
             observation: What the head reads.
             batch: `action` (B, A); with chunks (B, K, A), and `action_is_pad` (B, K), True past the end of an episode.
         """
-        return self.loss(observation, self.scaled_actions(batch), batch.get(f"{ACTION}_is_pad"))
+        action = self.scaled(batch[ACTION], self.state_at(batch))
+        return self.loss(observation, action, batch.get(f"{ACTION}_is_pad"))
 
     def loss(self, observation: Tensor, action: Tensor, is_pad: Tensor | None) -> Tensor:
         """The head's scalar loss, given scaled actions (B, A) or (B, K, A)."""

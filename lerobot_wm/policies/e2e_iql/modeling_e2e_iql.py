@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lerobot_wm.constants import ACTION
 from lerobot_wm.policies.common.iql import IQLPolicy
 from lerobot_wm.policies.e2e.policy import E2EPolicy
 from lerobot_wm.policies.e2e_iql.configuration_e2e_iql import E2EIQLConfig
@@ -42,5 +43,5 @@ class E2EIQLPolicy(IQLPolicy, E2EPolicy):
         now = self.observation(images[:, 0], self.state_at(batch, 0), tasks)  # (B, O)
         with torch.no_grad():
             following = self.observation(images[:, 1], self.state_at(batch, 1), tasks)  # (B, O)
-        action = self.scaled_actions(batch)  # (B, A)
+        action = self.scaled(batch[ACTION], self.state_at(batch, 0))  # (B, A)
         return self.agent.loss(now, following, action, *self.rewards_and_ends(batch))

@@ -62,6 +62,16 @@ class LatentPolicyConfig(ActingConfig):
         return self.world_model is not None and self.world_model.scales_latents
 
     @property
+    def freezes_world_model(self) -> bool:
+        """Whether the world model stays as pretrained."""
+        return True
+
+    @property
+    def reads_stored_latents(self) -> bool:
+        """Whether training reads the latents that `lerobot-wm encode` stores, and not images."""
+        return self.use_latent and self.freezes_world_model
+
+    @property
     def observation_dim(self) -> int:
         """Size of the networks' input: latent, one-hot task, proprioception, full state."""
         return self.latent_dim + len(self.tasks) + self.state_dim + self.env_state_dim

@@ -39,7 +39,7 @@ class LatentPolicy(ActingPolicy):
         config = self.config
         if config.world_model is not None:
             made = get_policy_class(config.world_model.type)(config.world_model)
-            self.world_model = made.world_model.requires_grad_(False).eval()
+            self.world_model = made.world_model.requires_grad_(not config.freezes_world_model).eval()
             # The layout of its images. Otherwise each decision copies all weights, which takes most of its time.
             self.world_model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # its stub lacks it
         if config.scales_latents:
@@ -57,7 +57,8 @@ class LatentPolicy(ActingPolicy):
                 encoder = load_encoder(config.world_model_path).world_model
             self.world_model.load_state_dict(encoder.state_dict())
             config.world_model_fingerprint = encoder_fingerprint(encoder)
-            config.check_latents(dataset_meta)
+            if config.reads_stored_latents:
+                config.check_latents(dataset_meta)
         super().fit_dataset(stats, dataset_meta)
         if config.scales_latents:
             self.latent_scaling.set_standard(*statistics(stats, OBS_LATENT, "mean", "std"))
@@ -67,7 +68,7 @@ class LatentPolicy(ActingPolicy):
     def continue_training(self, dataset_meta: LeRobotDatasetMetadata) -> None:
         """Also check that the dataset's latents are of this world model."""
         super().continue_training(dataset_meta)
-        if self.config.use_latent:
+        if self.config.reads_stored_latents:
             self.config.check_latents(dataset_meta)
 
     @property
@@ -81,7 +82,7 @@ class LatentPolicy(ActingPolicy):
         return self.config.latent_dim
 
     def train(self, mode: bool = True) -> "LatentPolicy":
-        """Switch training mode; the frozen world model stays in evaluation mode."""
+        """Switch training mode; the world model stays in evaluation mode, and filters as it will at test time."""
         self.training = mode
         for name, module in self.named_children():
             if name != "world_model":
@@ -97,9 +98,9 @@ class LatentPolicy(ActingPolicy):
         goes through children is not affected: state dict, device, copies.
         """
         memo = set() if memo is None else memo
-        frozen = getattr(self, "world_model", None)
-        if frozen is not None:
-            memo.add(frozen)
+        world_model = getattr(self, "world_model", None)
+        if world_model is not None and self.config.freezes_world_model:
+            memo.add(world_model)
         return super().named_modules(memo, prefix, remove_duplicate)
 
     def observation(

@@ -4,6 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
+from lerobot_wm.constants import ACTION
 from lerobot_wm.policies.common.iql import IQLPolicy
 from lerobot_wm.policies.latent.policy import LatentPolicy
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
@@ -33,4 +34,6 @@ class WMIQLPolicy(IQLPolicy, LatentPolicy):
         """
         tasks = self.one_hot_tasks(batch, self.batch_size(batch))  # (B, N)
         now, following = (self.observation_at(batch, tasks, t) for t in (0, 1))  # (B, O) each
-        return self.agent.loss(now, following, self.scaled_actions(batch), *self.rewards_and_ends(batch))
+        return self.agent.loss(
+            now, following, self.scaled(batch[ACTION], self.state_at(batch, 0)), *self.rewards_and_ends(batch)
+        )
