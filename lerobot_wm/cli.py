@@ -70,10 +70,10 @@ def load_plugins(arguments: list[str]) -> list[str]:
 
 
 def expand_home(argument: str) -> str:
-    """`--flag=~/path` with the home folder in place of `~`, which shells do not expand after an equals sign."""
-    flag, _, value = argument.partition("=")
-    is_home = re.match(r"~[\w.-]*(/|$)", value) is not None
-    return f"{flag}={expanduser(value)}" if flag.startswith("--") and is_home else argument
+    """`--flag=~/path`, or a list of paths, with the home folder in place of `~`, which shells do not expand there."""
+    if not argument.startswith("--"):
+        return argument
+    return re.sub(r"(?<=[=,[])~[\w.-]*(?=/|$)", lambda found: expanduser(found[0]), argument)
 
 
 def main() -> None:

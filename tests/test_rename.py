@@ -1,5 +1,6 @@
 """`lerobot-wm rename`: the same dataset under other names; the messages that lead to it."""
 
+import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -76,6 +77,21 @@ def test_rename_map_for_a_new_policy_names_the_command(
             "train", train_new(converted, tmp_path / "run"), '--rename_map={"actions":"action"}'
         )
     assert '--rename_map={"actions": "action"}' in advised(error.value)
+
+
+def test_rename_map_for_a_checkpoint_renames_observations_only(
+    converted: LeRobotDataset, lerobot_wm_command: Callable[..., None], tmp_path: Path
+) -> None:
+    copy = rename(converted, NAMES, "test/recorded", tmp_path / "copy")
+    lerobot_wm_command("train", train_new(copy, tmp_path / "run"))
+    checkpoint = tmp_path / "run/checkpoints/last/pretrained_model"
+    names = json.dumps(NAMES).replace(" ", "")
+    with pytest.raises(ValueError, match="observations only") as error:
+        lerobot_wm_command(
+            f"train --policy.path={checkpoint} --steps=2 {train_flags(converted)} --rename_map={names}",
+            f"--output_dir={tmp_path / 'further'}",
+        )
+    assert advised(error.value) == shlex.split(rename_command("test/recorded", converted.root, NAMES))[2:]
 
 
 def test_unknown_and_equal_names_are_refused(converted: LeRobotDataset, tmp_path: Path) -> None:

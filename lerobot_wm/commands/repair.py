@@ -14,6 +14,7 @@ from lerobot.datasets.utils import INFO_PATH, LEGACY_EPISODES_PATH, LEGACY_EPISO
 from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 from lerobot.utils.constants import DEFAULT_FEATURES
 
+from lerobot_wm.data.check import DatasetError
 from lerobot_wm.data.source import SourceConfig, dataset_folder, open_dataset
 from lerobot_wm.files import copy_dataset, new_folder
 from lerobot_wm.system import quiet
@@ -35,7 +36,7 @@ class RepairConfig:
 def repair(repo_id: str, root: Path, output_root: Path) -> None:
     """Write a copy in version 3, with `timestamp` = `frame_index` / fps and with all columns that number frames.
 
-    Numbers that are there are kept.
+    `index` is counted again. Other numbers that are there are kept.
 
     Raises:
         FileExistsError: `output_root` exists already.
@@ -54,6 +55,12 @@ def _convert(repo_id: str, root: Path) -> None:
     info = json.loads((root / INFO_PATH).read_text())
     if not info["codebase_version"].startswith("v2."):
         return
+    needed = STATS_PATH if info["codebase_version"] == "v2.0" else LEGACY_EPISODES_STATS_PATH
+    if not (root / needed).is_file():
+        raise DatasetError(
+            f"{repo_id} has no {needed}, which {info['codebase_version']} of LeRobot's format has: copy or download it "
+            "again, or make it with the version of LeRobot that recorded the data."
+        )
     if info["codebase_version"] == "v2.0":
         # LeRobot combines the statistics of all episodes, which version 2.0 lacks, into those of the dataset.
         stats = json.loads((root / STATS_PATH).read_text())
@@ -87,6 +94,8 @@ def _number_frames(root: Path) -> None:
             "index": np.repeat(rows["dataset_from_index"], lengths) + frame,
             "task_index": np.repeat([tasks[of_episode[0]] for of_episode in rows["tasks"]], lengths),
         }
+        if "index" in table.column_names and len(table) == len(frame):
+            table = table.drop_columns("index")
         for name, values in numbers.items():
             if name not in table.column_names and len(table) == len(values):
                 table = table.append_column(name, pa.array(np.asarray(values, np.int64)))

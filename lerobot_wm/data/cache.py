@@ -56,7 +56,7 @@ def cache_root(dataset_root: Path) -> Path:
     if place:
         # Many datasets are in a folder of the same name.
         digest = hashlib.sha256(str(dataset_root.resolve()).encode()).hexdigest()[:_DIGEST_DIGITS]
-        root = Path(place) / f"{dataset_root.name}-{digest}"
+        root = Path(place).expanduser() / f"{dataset_root.name}-{digest}"
     elif is_snapshot(dataset_root):
         repository = dataset_root.parents[1].name.removeprefix("datasets--")
         root = HF_LEROBOT_HOME / "lerobot_wm" / f"{repository}--{dataset_root.name}.cache"

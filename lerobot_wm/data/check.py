@@ -164,7 +164,10 @@ def check_dataset(
 def _check_names(meta: LeRobotDatasetMetadata) -> None:
     # Names of cameras become names of files in the cache.
     if bad := [name for name in meta.features if "/" in name]:
-        raise DatasetError(f"{meta.root / INFO_PATH}: feature {bad[0]!r} has a slash in its name: rename it.")
+        raise DatasetError(
+            f"{meta.root / INFO_PATH}: feature {bad[0]!r} has a slash in its name, which LeRobot takes "
+            "for a folder: record or convert the data with another name."
+        )
     path = meta.root / DEFAULT_TASKS_PATH
     numbers = read_file(path, lambda _: list(meta.tasks["task_index"]))
     # Task strings are looked up by their row.
@@ -211,6 +214,9 @@ def _files_read(
     }
 
 
+_DISORDER = "frames are repeated, missing or out of order, or belong to other episodes"
+
+
 def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial: bool) -> None:
     paths = {meta.root / meta.get_data_file_path(episode) for episode in range(len(episodes))}
     unknown = sorted(set((meta.root / "data").glob("*/*.parquet")) - paths)
@@ -218,7 +224,7 @@ def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial:
         raise DatasetError(
             f"{unknown[0]} belongs to no episode, but LeRobot would read it: remove the file, or {FIX}."
         )
-    columns = ["index", "episode_index", "timestamp"]
+    columns = ["index", "episode_index", "frame_index", "timestamp"]
     files = _files_read(
         episodes, "data", lambda episode: meta.root / meta.get_data_file_path(episode), partial
     )
@@ -233,10 +239,11 @@ def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial:
         frame = np.concatenate([np.arange(length) for length in lengths])
         first = np.repeat(rows["dataset_from_index"].to_numpy(), lengths)
         episode = np.repeat(rows["episode_index"].to_numpy(), lengths)
-        if (table["index"] != first + frame).any() or (table["episode_index"] != episode).any():
-            raise DatasetError(
-                f"{path}: frames are repeated, missing or out of order, or belong to other episodes: {FIX}."
-            )
+        is_in_order = (table["episode_index"] == episode).all() and (table["frame_index"] == frame).all()
+        if (table["index"] != first + frame).any() or not is_in_order:
+            fix = how_to_repair(meta.repo_id, meta.root) if is_in_order else FIX
+            what = "index does not count the dataset's frames" if is_in_order else _DISORDER
+            raise DatasetError(f"{path}: {what}: {fix}.")
         if not (abs(table["timestamp"] * meta.fps - frame) < 0.5).all():
             step = float(table["timestamp"].diff()[frame > 0].median())
             raise DatasetError(

@@ -16,6 +16,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.logging_utils import MetricsTracker
 
 from lerobot_wm.constants import OBS_LATENT, TRAIN_LOG_NAME
+from lerobot_wm.data.check import DatasetError
 from lerobot_wm.data.source import damaged_tables_named, open_dataset
 from lerobot_wm.encode.dataset import LATENTS_PREFIX, encode_to_cache
 from lerobot_wm.errors import check_can_push
@@ -96,10 +97,27 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
         revision = f"@{policy.pretrained_revision}" if policy.pretrained_revision else ""
         encoder = f"{policy.pretrained_path}{revision}"
     if encoder is not None:
-        open_dataset(*where)  # all episodes are encoded
+        if cfg.dataset.episodes is not None:
+            check_all_episodes_are_there(cfg, meta)
         encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device), cfg.rename_map)
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None
+
+
+def check_all_episodes_are_there(cfg: TrainPipelineConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Check that a dataset of which some episodes are chosen can be encoded: all of them are.
+
+    Raises:
+        DatasetError: Files of other episodes are missing.
+    """
+    try:
+        open_dataset(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
+    except DatasetError as error:
+        raise DatasetError(
+            f"A policy on latents encodes all {meta.total_episodes} episodes, not only --dataset.episodes="
+            f"{cfg.dataset.episodes}: {error} Or train one that reads the images of these episodes alone: wm_bc with "
+            "--policy.finetune_world_model=true, or e2e_bc."
+        ) from error
 
 
 def check_new_policy(

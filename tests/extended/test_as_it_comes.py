@@ -23,6 +23,7 @@ from lerobot_wm.commands.repair import repair
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.source import DatasetError, open_dataset
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
+from lerobot_wm.policies.e2e_bc.modeling_e2e_bc import E2EBCPolicy
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from tests.flags import SMALL_WORLD_MODEL
 from tests.recording import FRONT, camera, record, train_flags, vector
@@ -118,6 +119,15 @@ def test_files_of_other_episodes_may_be_missing(
     lerobot_wm_command(
         "train --dataset.episodes=[0,2]", STEPS, train_flags(dataset), f"--output_dir={tmp_path / 'run'}"
     )
+    # Policies on latents encode all episodes. The advice is to train one that reads images.
+    policy = (
+        f"--policy.type=wm_bc --policy.world_model_path={tmp_path / 'run/checkpoints/last/pretrained_model'}"
+    )
+    flags = f"train --dataset.episodes=[0,2] {policy} --steps=2 --batch_size=2 {train_flags(dataset)}"
+    with pytest.raises(DatasetError, match=r"--policy.finetune_world_model=true") as refusal:
+        lerobot_wm_command(flags, f"--output_dir={tmp_path / 'policy'}")
+    assert "file-001" in str(refusal.value)
+    lerobot_wm_command(flags, f"--policy.finetune_world_model=true --output_dir={tmp_path / 'policy'}")
 
 
 @pytest.mark.parametrize("everywhere", [False, True])
@@ -136,6 +146,30 @@ def test_nan_is_named_and_removed(everywhere: bool, tmp_path: Path) -> None:
     assert meta.total_episodes == (3 if everywhere else 2)
 
 
+def test_actions_that_are_nan_everywhere_have_no_removal(tmp_path: Path) -> None:
+    def labels(t: int, length: int) -> dict[str, Any]:
+        return {"action": np.full(6, np.nan if t == length - 1 else t, np.float32)}
+
+    small(tmp_path / "recorded", labels=labels)
+    with pytest.raises(DatasetError, match=r"action is NaN .* every episode; in episode 0, it is in frame 5"):
+        open_dataset(NAME, tmp_path / "recorded")
+
+
+def test_cameras_may_have_any_name_after_observation(
+    tmp_path: Path, lerobot_wm_command: Callable[..., None]
+) -> None:
+    features = {"observation.rgb": camera(32, 48), "observation.state": vector(6), "action": vector(6)}
+    dataset = record(tmp_path / "data", features, [("Wave", 6), ("Wave", 9)])
+    lerobot_wm_command(
+        f"train --policy.type=e2e_bc --steps=1 --batch_size=2 {train_flags(dataset)}",
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    path = tmp_path / "run/checkpoints/last/pretrained_model"
+    policy = E2EBCPolicy.from_pretrained(path)
+    frame = {key: dataset[0][key][None] for key in ("observation.rgb", "observation.state")}
+    assert policy.select_action(frame | {"task": ["Wave"]}).shape == (1, 6)
+
+
 def write_wall_clock(root: Path) -> None:
     times = [t * 0.11 + 0.01 * (t % 3) for length in (6, 9, 7) for t in range(length)]
     set_column(root, "timestamp", times)
@@ -150,6 +184,10 @@ def remove_numbering(root: Path) -> None:
 def remove_columns(root: Path) -> None:
     table = pq.read_table(root / DATA).drop_columns(["episode_index", "index", "task_index", "timestamp"])
     pq.write_table(table, root / DATA)
+
+
+def number_within_episodes(root: Path) -> None:
+    set_column(root, "index", [t for length in (6, 9, 7) for t in range(length)])
 
 
 def as_version_2(root: Path, version: str) -> None:
@@ -186,7 +224,9 @@ def as_version_2(root: Path, version: str) -> None:
     (root / "meta/info.json").write_text(json.dumps(info))
 
 
-@pytest.mark.parametrize("spoil", [write_wall_clock, remove_numbering, remove_columns])
+@pytest.mark.parametrize(
+    "spoil", [write_wall_clock, remove_numbering, remove_columns, number_within_episodes]
+)
 def test_a_repaired_copy_has_frames_as_they_were_recorded(
     spoil: Callable[[Path], None], tmp_path: Path
 ) -> None:
@@ -222,6 +262,18 @@ def test_data_of_lerobot_2_is_converted(version: str, video_episodes: Path, tmp_
             assert torch.equal(recorded[row][key], converted[row][key]), key
     assert sorted(path.name for path in output.parent.iterdir()) == [output.name]
     assert (root / "meta/episodes.jsonl").exists()
+
+
+@pytest.mark.parametrize(("version", "name"), [("v2.0", "stats.json"), ("v2.1", "episodes_stats.jsonl")])
+def test_statistics_that_conversion_needs_are_named(
+    version: str, name: str, video_episodes: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(video_episodes, tmp_path / "recorded")
+    as_version_2(root, version)
+    (root / "meta" / name).unlink()
+    with pytest.raises(DatasetError, match=re.escape(f"meta/{name}")):
+        repair(NAME, root, tmp_path / "output")
+    assert not (tmp_path / "output").exists()
 
 
 def test_what_repair_cannot_mend_is_not_written(tmp_path: Path) -> None:

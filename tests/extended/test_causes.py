@@ -195,6 +195,8 @@ def test_the_home_folder_after_an_equals_sign(monkeypatch: pytest.MonkeyPatch) -
     for given, expected in {
         "--root=~/x": "--root=/home/me/x",
         "--policy.path=~": "--policy.path=/home/me",
+        "--compare=[~/x,~/y]": "--compare=[/home/me/x,/home/me/y]",
+        "--train_logs=a,~/y": "--train_logs=a,/home/me/y",
         "--root=a/~b": "--root=a/~b",
         "--task=~ 5 cm": "--task=~ 5 cm",
         "--resume": "--resume",

@@ -154,6 +154,7 @@ def model_card(
         evaluation=None if makes_latents else Markdown(eval_command(config, repo_id)),
         hidden_action_share=rssm.get("hidden_action_share"),
         action_shape=(1, *config.output_features[ACTION].shape),
+        tasks=getattr(config, "known_tasks", []),
         inputs={key: tuple(config.input_features[key].shape) for key in config.features_read},
         run=cfg,
         command=Markdown(train_command(cfg, data.latents if data else None)) if cfg else None,
@@ -177,6 +178,6 @@ def _example(config: PolicyConfig, settings: dict) -> str:
         f"{key!r}: torch.{'rand' if feature.type is FeatureType.VISUAL else 'zeros'}{(1, *feature.shape)}"
         for key, feature in config.input_features.items()
     ]
-    if settings.get("tasks"):
-        batch.append(f"{TASK!r}: {settings['tasks'][:1]!r}")
+    if tasks := getattr(config, "known_tasks", []):
+        batch.append(f"{TASK!r}: {tasks[:1]!r}")
     return f"batch = {{{', '.join(batch)}}}  # images in [0, 1]"

@@ -62,8 +62,13 @@ def check_reads(
 
     Raises:
         ValueError: A feature is missing or has another size. Cameras may have any size, and a policy may read latents
-            instead.
+            instead. Or `rename_map` names the action, which LeRobot renames nowhere.
     """
+    if ACTION in rename_map.values():
+        raise ValueError(
+            f"--rename_map={json.dumps(dict(rename_map))} renames observations only, and not '{ACTION}'. Use a renamed "
+            f"copy: {rename_command(dataset_meta.repo_id, dataset_meta.root, rename_map)}"
+        )
     keys = _vectors(config)
     missing = [key for key in names_before(keys, rename_map) if key not in dataset_meta.features]
     if missing:
@@ -104,7 +109,7 @@ def rename_command(repo_id: str, root: str | Path | None, names: Mapping[str, st
     """The command that makes a copy of a dataset with these new names."""
     place = [] if root is None else [f"--dataset.root={root}"]
     copy = f"{root or repo_id.rsplit('/')[-1]}_renamed"
-    flags = [f"--dataset.repo_id={repo_id}", *place, f"--rename_map={json.dumps(names)}"]
+    flags = [f"--dataset.repo_id={repo_id}", *place, f"--rename_map={json.dumps(dict(names))}"]
     flags += [f"--output_repo_id={repo_id}_renamed", f"--output_root={copy}"]
     return f"lerobot-wm rename {shlex.join(flags)}"
 

@@ -12,7 +12,7 @@ from lerobot.optim import LRSchedulerConfig
 
 from lerobot_wm.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_wm.nn.images import channels_first
-from lerobot_wm.policies.common.features import feature_dim, image_keys, is_image
+from lerobot_wm.policies.common.features import feature_dim, image_keys
 from lerobot_wm.policies.common.optim import FinalDecayConfig, FusedAdamConfig
 
 logger = logging.getLogger(__name__)
@@ -235,7 +235,8 @@ class PolicyConfig(PreTrainedConfig):
         Raises:
             ValueError: A feature is missing or has another shape; says where it can be set.
         """
-        check_cameras_present(self, [key for key in shapes if is_image(key)], "the observation")
+        cameras = [key for key, shape in shapes.items() if len(shape) == len(("C", "H", "W"))]
+        check_cameras_present(self, cameras, "the observation")
         for key in self.features_read:
             expected = tuple(self.input_features[key].shape)
             if key not in shapes:

@@ -15,11 +15,6 @@ from lerobot_wm.nn.images import channels_first
 Statistics = Mapping[str, Mapping[str, Any]]
 
 
-def is_image(key: str) -> bool:
-    """Whether a key of a batch names a camera's images."""
-    return key.startswith("observation.image") and not key.endswith("_is_pad")
-
-
 def feature_dim(features: dict[str, PolicyFeature], key: str) -> int:
     """Size of the vector feature `key`.
 
