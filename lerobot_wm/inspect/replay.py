@@ -250,16 +250,11 @@ def _frames(
 def trained_episodes(path: str, meta: LeRobotDatasetMetadata) -> set[int]:
     """The dataset's episodes that a checkpoint was trained on, by the configuration beside it; all where it has none.
 
-    None of a dataset with another name than the one it was trained on. LeRobot's `--dataset.eval_split` holds out the
-    last episodes of each task.
+    LeRobot's `--dataset.eval_split` holds out the last episodes of each task.
     """
     folder, revision = split_revision(path)
     file = checkpoint_file(folder, "train_config.json", revision)
     settings = {} if file is None else read_json(file)["dataset"]
-    if settings.get("repo_id", meta.repo_id).removesuffix("_latents") != meta.repo_id.removesuffix(
-        "_latents"
-    ):
-        return set()
     episodes = set(settings.get("episodes") or range(meta.total_episodes))
     share = settings.get("eval_split") or 0.0
     trained = set()
