@@ -214,9 +214,6 @@ def _files_read(
     }
 
 
-_DISORDER = "frames are repeated, missing or out of order, or belong to other episodes"
-
-
 def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial: bool) -> None:
     paths = {meta.root / meta.get_data_file_path(episode) for episode in range(len(episodes))}
     unknown = sorted(set((meta.root / "data").glob("*/*.parquet")) - paths)
@@ -239,11 +236,14 @@ def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial:
         frame = np.concatenate([np.arange(length) for length in lengths])
         first = np.repeat(rows["dataset_from_index"].to_numpy(), lengths)
         episode = np.repeat(rows["episode_index"].to_numpy(), lengths)
-        is_in_order = (table["episode_index"] == episode).all() and (table["frame_index"] == frame).all()
-        if (table["index"] != first + frame).any() or not is_in_order:
-            fix = how_to_repair(meta.repo_id, meta.root) if is_in_order else FIX
-            what = "index does not count the dataset's frames" if is_in_order else _DISORDER
-            raise DatasetError(f"{path}: {what}: {fix}.")
+        if not ((table["episode_index"] == episode).all() and (table["frame_index"] == frame).all()):
+            raise DatasetError(
+                f"{path}: frames are repeated, missing or out of order, or belong to other episodes: {FIX}."
+            )
+        if (table["index"] != first + frame).any():
+            raise DatasetError(
+                f"{path}: index does not count the dataset's frames: {how_to_repair(meta.repo_id, meta.root)}."
+            )
         if not (abs(table["timestamp"] * meta.fps - frame) < 0.5).all():
             step = float(table["timestamp"].diff()[frame > 0].median())
             raise DatasetError(

@@ -202,12 +202,12 @@ def check_finite_columns(columns: Mapping[str, Tensor], meta: LeRobotDatasetMeta
         )
         damaged = columns["episode_index"][~is_finite].int().unique().tolist()
         removal = f"--operation.type=delete_episodes --operation.episode_indices='{damaged}'"
-        if len(damaged) == meta.total_episodes and key == ACTION:
-            raise DatasetError(
-                f"{meta.repo_id}: {key} is NaN or Inf in every episode; in episode {episode}, it is in frame {frame}. "
-                "Leave out these frames where the data was recorded or converted, and make the dataset again."
-            )
         if len(damaged) == meta.total_episodes:
+            if key == ACTION:
+                raise DatasetError(
+                    f"{meta.repo_id}: {key} is NaN or Inf in every episode; in episode {episode}, it is in frame "
+                    f"{frame}. Leave out these frames where the data was recorded or converted, and make it again."
+                )
             removal = f"--operation.type=remove_feature --operation.feature_names=\"['{key}']\""
         name = meta.repo_id.split("/")[-1]
         raise DatasetError(

@@ -24,6 +24,9 @@ IDENTITY_NORMALIZATION: dict[str, NormalizationMode] = dict.fromkeys(
 )
 
 
+_IMAGE_AXES = 3  # (C, H, W)
+
+
 @dataclass
 class PolicyConfig(PreTrainedConfig):
     """Base of all our policy configurations: cameras, precision, and Adam at one learning rate.
@@ -235,7 +238,7 @@ class PolicyConfig(PreTrainedConfig):
         Raises:
             ValueError: A feature is missing or has another shape; says where it can be set.
         """
-        cameras = [key for key, shape in shapes.items() if len(shape) == len(("C", "H", "W"))]
+        cameras = [key for key, shape in shapes.items() if len(shape) == _IMAGE_AXES]
         check_cameras_present(self, cameras, "the observation")
         for key in self.features_read:
             expected = tuple(self.input_features[key].shape)
