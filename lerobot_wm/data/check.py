@@ -236,7 +236,7 @@ def _check_tables(meta: LeRobotDatasetMetadata, episodes: pd.DataFrame, partial:
         frame = np.concatenate([np.arange(length) for length in lengths])
         first = np.repeat(rows["dataset_from_index"].to_numpy(), lengths)
         episode = np.repeat(rows["episode_index"].to_numpy(), lengths)
-        if not ((table["episode_index"] == episode).all() and (table["frame_index"] == frame).all()):
+        if (table["episode_index"] != episode).any() or (table["frame_index"].diff()[frame > 0] != 1).any():
             raise DatasetError(
                 f"{path}: frames are repeated, missing or out of order, or belong to other episodes: {FIX}."
             )

@@ -247,6 +247,13 @@ def test_a_repaired_copy_has_frames_as_they_were_recorded(
     assert (root / DATA).read_bytes() == before
 
 
+def test_frames_may_be_counted_from_any_number(tmp_path: Path) -> None:
+    root = tmp_path / "trimmed"
+    small(root)
+    set_column(root, "frame_index", [t + 30 for length in (6, 9, 7) for t in range(length)])
+    open_dataset(NAME, root)
+
+
 @pytest.mark.parametrize("version", ["v2.0", "v2.1"])
 def test_data_of_lerobot_2_is_converted(version: str, video_episodes: Path, tmp_path: Path) -> None:
     recorded = LeRobotDataset(NAME, root=video_episodes)

@@ -12,6 +12,7 @@ from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.policies.latent.policy import load_encoder
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
+from tests.flags import TRAIN_FLAGS
 from tests.recording import train_flags
 
 LENGTH, CHUNK = 6, 3
@@ -106,3 +107,41 @@ def test_it_acts_on_the_fine_tuned_filter(run: Path, demos: LeRobotDataset) -> N
 def test_a_policy_without_a_world_model_has_none_to_train() -> None:
     with pytest.raises(ValueError, match="use_latent"):
         WMBCConfig(device="cpu", finetune_world_model=True, use_latent=False)
+
+
+@pytest.mark.parametrize(
+    ("flag", "named"),
+    [
+        ({"random_crop_pad": 4}, "finetune_world_model=true"),
+        ({"random_crop_pad": -1, "finetune_world_model": True}, "random_crop_pad=-1"),
+        ({"window_length": 0, "finetune_world_model": True}, "window_length=0"),
+    ],
+)
+def test_flags_without_effect_or_meaning_are_refused(flag: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        WMBCConfig(device="cpu", **flag)
+
+
+def test_latents_and_frozen_backbones_cannot_be_fine_tuned(
+    demos: LeRobotDataset,
+    latents_root: Path,
+    world_model_path: Path,
+    lerobot_wm_command: Callable[..., None],
+    tmp_path: Path,
+) -> None:
+    backbone = tmp_path / "backbone" / "pretrained_model"
+    data = f"--dataset.repo_id=test/demos --dataset.root={demos.root}"
+    lerobot_wm_command(
+        f"init --policy.type=frozen_backbone --policy.device=cpu {data} --output_dir={backbone}"
+    )
+    train = "train --policy.type=wm_bc --policy.finetune_world_model=true --steps=1"
+    with pytest.raises(ValueError, match="test/latents"):
+        lerobot_wm_command(
+            f"{train} --policy.world_model_path={world_model_path} --output_dir={tmp_path / 'run'}",
+            f"{TRAIN_FLAGS} --dataset.repo_id=test/latents --dataset.root={latents_root}",
+        )
+    with pytest.raises(ValueError, match="frozen_backbone"):
+        lerobot_wm_command(
+            f"{train} --policy.world_model_path={backbone / 'pretrained_model'} --output_dir={tmp_path / 'run'}",
+            train_flags(demos),
+        )

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
+from lerobot_wm.constants import OBS_LATENT
 from lerobot_wm.policies.common.bc import BCPolicyConfig
 from lerobot_wm.policies.latent.config import LatentPolicyConfig
 
@@ -32,8 +34,43 @@ class WMBCConfig(BCPolicyConfig, LatentPolicyConfig):
                 "--policy.finetune_world_model=true, but --policy.use_latent=false leaves the world model out: give "
                 "one of the two flags."
             )
-        if self.window_length < 1:
-            raise ValueError(f"--policy.window_length={self.window_length}: expected at least 1 frame.")
+        if self.window_length < 1 or self.random_crop_pad < 0:
+            raise ValueError(
+                f"--policy.window_length={self.window_length} --policy.random_crop_pad={self.random_crop_pad}: "
+                "expected at least 1 frame, and 0 pixels or more."
+            )
+        if self.random_crop_pad and not self.finetune_world_model:
+            raise ValueError(
+                f"--policy.random_crop_pad={self.random_crop_pad} shifts images, but this policy trains on latents: "
+                "leave the flag out, or add --policy.finetune_world_model=true."
+            )
+
+    def validate_features(self) -> None:
+        """Also check that the world model can be trained.
+
+        Raises:
+            ValueError: It cannot.
+        """
+        super().validate_features()
+        if self.finetune_world_model and self.scales_latents:
+            assert self.world_model is not None  # whose latents are scaled
+            raise ValueError(
+                f"--policy.finetune_world_model=true, but a {self.world_model.type} stays frozen: leave the flag out, "
+                "or give --policy.world_model_path of a wm_rssm."
+            )
+
+    def check_dataset(self, dataset_meta: LeRobotDatasetMetadata) -> None:
+        """Check that there are images for a world model that is trained.
+
+        Raises:
+            ValueError: The dataset holds latents.
+        """
+        super().check_dataset(dataset_meta)
+        if self.finetune_world_model and OBS_LATENT in dataset_meta.features:
+            raise ValueError(
+                f"--policy.finetune_world_model=true trains on images, and {dataset_meta.repo_id} holds latents: give "
+                "the dataset that it was encoded from."
+            )
 
     @property
     def freezes_world_model(self) -> bool:

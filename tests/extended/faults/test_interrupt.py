@@ -43,7 +43,7 @@ def test_the_same_command_goes_on(name: str, processes: Commands, inputs: Inputs
 def test_training_says_how_to_go_on(processes: Commands, inputs: Inputs, tmp_path: Path) -> None:
     run = tmp_path / "run"
     last = run / "checkpoints" / "last"
-    work = processes.start(inputs.command("train", run), "--steps=150")
+    work = processes.start(inputs.command("train", run), "--steps=3000")
     ended = work.interrupt_when(last.exists)
     check_interrupted(ended)
     _, advice, _ = ended.last_line.split("`")
