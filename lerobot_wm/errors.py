@@ -118,12 +118,13 @@ def cache_folders() -> dict[str, Path]:
 
 def line_for(error: Exception) -> str | None:
     """The one line that tells the user what to do; None for an error that keeps its traceback."""
+    # LeRobot asks the Hub for a file that it cannot read on this machine: then the disk is the cause.
+    if (problem := disk_problem(error)) is not None:
+        return f"{problem}; then run the same command again; it resumes or starts over."
     # In a chain of errors the first about the Hub says most: those before wrap it, those after are httpx's.
     for cause in _causes(error):
         if (refusal := _hub_problem(cause)) is not None:
             return refusal
-    if (problem := disk_problem(error)) is not None:
-        return f"{problem}; then run the same command again; it resumes or starts over."
     if _is_ours(error):
         return one_line(error)
     if any(module.startswith(_PARSERS) for module in _modules(error)):

@@ -265,7 +265,7 @@ def trained_episodes(path: str, meta: LeRobotDatasetMetadata) -> set[int]:
 
 
 def joint_names(meta: LeRobotDatasetMetadata) -> list[str]:
-    """The names of the action's numbers; their indices where the dataset does not name them."""
+    """The names of the action's numbers; their indices where the dataset does not name them, or two alike."""
     names, size = meta.features[ACTION].get("names"), meta.features[ACTION]["shape"][0]
     while isinstance(names, dict) and len(names) == 1:
         [names] = names.values()
@@ -273,7 +273,7 @@ def joint_names(meta: LeRobotDatasetMetadata) -> list[str]:
         [names] = names
     return (
         [str(name) for name in names]
-        if isinstance(names, list) and len(names) == size
+        if isinstance(names, list) and len(set(map(str, names))) == size
         else list(map(str, range(size)))
     )
 

@@ -55,6 +55,12 @@ def check_flags(cfg: TrainPipelineConfig, given: Collection[str]) -> None:
     if cfg.resume:
         _check_resumed_optimizer(cfg, given)
         return
+    of_policy = [name for name in given if name.startswith(_POLICY_OPTIMIZER_FLAGS)]
+    if of_policy and not cfg.use_policy_training_preset:
+        raise ValueError(
+            f"{_listed(of_policy)} would have no effect under --use_policy_training_preset=false: set the learning "
+            "rate and its schedule with --optimizer.lr and --scheduler.type."
+        )
     ignored = [name for name in given if name.startswith(_OPTIMIZER_FLAGS[:2])]
     if ignored and cfg.use_policy_training_preset:
         raise ValueError(

@@ -71,6 +71,8 @@ def test_an_optimizer_that_the_policy_chooses_is_not_set_beside_it(
         check_flags(settings, ["policy.lr", flag])
     settings.use_policy_training_preset = False
     check_flags(settings, [flag])
+    with pytest.raises(ValueError, match=r"--policy\.lr .*--optimizer\.lr"):
+        check_flags(settings, ["policy.lr"])
 
 
 def test_a_resumed_run_keeps_its_optimizer(settings: TrainPipelineConfig) -> None:
@@ -160,6 +162,8 @@ def test_a_cache_that_cannot_be_written_is_no_damaged_dataset(
         open_dataset("a/b", tmp_path / "copy")
     assert not isinstance(error.value, DatasetError)
     assert "HF_DATASETS_CACHE" in str(disk_problem(error.value))
+    with pytest.raises(SystemExit, match="HF_DATASETS_CACHE"), exit_with_one_line("command"):
+        LeRobotDataset("a/b", root=tmp_path / "copy")  # which then asks the Hub
 
 
 def test_a_file_that_is_damaged_is_called_so(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 import torch
 
-from lerobot_wm.rl.flow import FlowHead
+from lerobot_wm.rl.bc import FlowHead
 
 
 def test_the_flow_keeps_both_ways_to_solve_a_task() -> None:

@@ -11,8 +11,7 @@ from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.common.acting_config import ActingConfig
 from lerobot_wm.policies.common.acting_policy import ActingPolicy
 from lerobot_wm.policies.common.config import compiled
-from lerobot_wm.rl.bc import bc_loss, mean_without_padding
-from lerobot_wm.rl.flow import FlowHead
+from lerobot_wm.rl.bc import FlowHead, bc_loss, mean_without_padding
 
 HEADS = ("regression", "flow")
 

@@ -1,6 +1,8 @@
 """The base class of all our policies: how one is created, loaded, trained and saved."""
 
 import logging
+import math
+from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, NoReturn, Self
@@ -12,14 +14,13 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_wm.constants import ACTION
 from lerobot_wm.policies.common.card import TrainingData, model_card
 from lerobot_wm.policies.common.checkpoint import WHOLE, CheckpointError, cut_short, not_finite, read_config
 from lerobot_wm.policies.common.checks import check_has_stats, check_names, check_sizes, dataset_cameras
 from lerobot_wm.policies.common.config import PolicyConfig, train_new
-from lerobot_wm.policies.common.divergence import check_finite, check_finite_weights
 from lerobot_wm.policies.common.features import Statistics
 from lerobot_wm.policies.common.names import current_names
 
@@ -218,3 +219,60 @@ class BasePolicy(PreTrainedPolicy):
         """The card that LeRobot publishes with a policy after training; its other arguments are in `cfg`."""
         data = None if dataset_meta is None else TrainingData.of(dataset_meta)
         return model_card(self.config, self.config.repo_id or self.name, cfg, data)
+
+
+class DivergenceError(RuntimeError):
+    """A loss or a weight is NaN or infinite. The message is one line: what, and what to do."""
+
+
+def check_finite(numbers: Mapping[str, float], config: object, batch: Mapping[str, Any]) -> None:
+    """Stop a training whose loss is not finite.
+
+    Every policy's `forward` calls it, so that `lerobot-train` stops as `lerobot-wm train` does.
+
+    Args:
+        numbers: The loss and its parts, by name.
+        config: The policy's configuration, whose settings the message advises on.
+        batch: The training batch; its episodes are named where it has `episode_index`.
+
+    Raises:
+        DivergenceError: A number is NaN or infinite.
+    """
+    broken = [name for name, value in numbers.items() if not math.isfinite(value)]
+    if not broken:
+        return
+    where = ""
+    if "episode_index" in batch:
+        episodes = batch["episode_index"].unique().tolist()  # sorted
+        where = f" on a batch of episodes {', '.join(map(str, episodes))}"
+    raise DivergenceError(
+        f"Training diverged: {', '.join(broken)} is NaN or infinite{where}. {_advice(config)}"
+    )
+
+
+def check_finite_weights(policy: nn.Module, config: object) -> None:
+    """Keep weights that are not finite out of a checkpoint: a gradient can be so where the loss is not.
+
+    Args:
+        policy: What is to be saved.
+        config: Its configuration, whose settings the message advises on.
+
+    Raises:
+        DivergenceError: A parameter or buffer is NaN or infinite.
+    """
+    broken = [name for name, tensor in policy.state_dict().items() if not torch.isfinite(tensor).all()]
+    if broken:
+        rest = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+        raise DivergenceError(
+            f"Training diverged: {broken[0]}{rest} holds NaN or infinite weights. {_advice(config)}"
+        )
+
+
+def _advice(config: object) -> str:
+    rate = next(
+        (f"--policy.{name}" for name in ("lr", "optimizer_lr") if hasattr(config, name)), "learning rate"
+    )
+    advice = f"Train again with a lower {rate}"
+    if getattr(config, "dtype", None) == "bfloat16":
+        advice += ", or in --policy.dtype=float32"
+    return f"{advice}. Earlier checkpoints are not affected."

@@ -17,7 +17,7 @@ from lerobot_wm.collect.shards import Shard, write_shard
 from lerobot_wm.data.loader import RamDataset
 from lerobot_wm.data.source import DatasetError, SourceConfig
 from lerobot_wm.envs.simulation import Simulation
-from lerobot_wm.policies.common.divergence import DivergenceError, check_finite, check_finite_weights
+from lerobot_wm.policies.common.policy import DivergenceError, check_finite, check_finite_weights
 from lerobot_wm.policies.wm_rssm.configuration_wm_rssm import WMRSSMConfig
 from lerobot_wm.policies.wm_rssm.modeling_wm_rssm import WMRSSMPolicy
 from lerobot_wm.world_model.config import RSSMConfig

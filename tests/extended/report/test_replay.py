@@ -7,11 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect.episodes import CheckpointConfig
-from lerobot_wm.inspect.replay import HOLD, OWN, RECORDED, REPEAT, ReplayConfig, replay, trained_episodes
+from lerobot_wm.inspect.replay import (
+    HOLD,
+    OWN,
+    RECORDED,
+    REPEAT,
+    ReplayConfig,
+    joint_names,
+    replay,
+    trained_episodes,
+)
 from lerobot_wm.policies.wm_bc.modeling_wm_bc import WMBCPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
@@ -121,3 +131,17 @@ def test_a_world_model_and_an_unknown_episode_are_refused(
         replay(ReplayConfig(CheckpointConfig(str(world_model_path)), source))
     with pytest.raises(ValueError, match=r"test/demos.* 8 .*\[8\].*0 to 7"):
         replay(ReplayConfig(CheckpointConfig(str(policy_paths["wm_bc"])), source, episodes=[8]))
+
+
+@pytest.mark.parametrize(
+    ("names", "shown"),
+    [
+        (["lift", "turn"], ["lift", "turn"]),
+        ({"motors": ["lift", "turn"]}, ["lift", "turn"]),
+        (["j", "j"], ["0", "1"]),
+    ],
+)
+def test_each_joint_has_a_name(names: object, shown: list[str], tmp_path: Path) -> None:
+    action = {"dtype": "float32", "shape": (2,), "names": names}
+    meta = LeRobotDatasetMetadata.create("a/b", 10, {"action": action}, root=tmp_path / "data")
+    assert joint_names(meta) == shown

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from lerobot_wm.nn.image_encoders import FEATURE_DIM, ImageEncoder, SpatialEmbeddings
 from lerobot_wm.nn.images import random_crop
+from lerobot_wm.policies.e2e.policy import FEATURE_DIM, ImageEncoder, SpatialEmbeddings
 
 
 def test_spatial_embeddings_equal_a_plain_loop() -> None:
