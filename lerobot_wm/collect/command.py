@@ -51,6 +51,9 @@ class CollectConfig:
     variation_set: int = REPORTED_VARIATION_SET
     # Standard deviation of the Gaussian noise added to the expert's clipped actions.
     noise: float = 0.3
+    # Share of episodes that begin in the middle, after the hand was moved away and dropped what it held: they show the
+    # policy how to come back, and objects at further places.
+    disturbed_share: float = 0.0
     # Steps kept after the first success, so that successful observations are in the data.
     steps_after_success: int = 8
     # Attempts at a variation before its episode is collected on the next one.
@@ -91,6 +94,7 @@ class CollectConfig:
             "variation_set": self.variation_set,
             "variations": list(parse_variations(self.variations)),
             "noise": self.noise,
+            "disturbed_share": self.disturbed_share,
             "steps_after_success": self.steps_after_success,
             "max_attempts": self.max_attempts,
             "image_size": self.image_size,
@@ -165,6 +169,8 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
     check_variation_set(config.variation_set)
     if config.episodes_per_task < 1:
         raise ValueError(f"--episodes_per_task={config.episodes_per_task}: expected at least 1.")
+    if not 0 <= config.disturbed_share <= 1:
+        raise ValueError(f"--disturbed_share={config.disturbed_share:g}: expected 0 to 1.")
     for description, (first_task, *others) in tasks_of_one_description(tasks).items():
         kept = ",".join(task for task in tasks if task not in others)
         raise ValueError(
@@ -179,6 +185,7 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
             variation_set=config.variation_set,
             variations=variations,
             noise=config.noise,
+            disturbed_share=config.disturbed_share,
             steps_after_success=config.steps_after_success,
             max_attempts=config.max_attempts,
             seed=config.seed,
@@ -198,7 +205,7 @@ def _is_complete(config: CollectConfig, root: Path) -> bool:
         raise FileExistsError(
             f"{root} exists and was not made by `lerobot-wm collect`: give another --root or remove it."
         )
-    found = json.loads(record.read_text())["config"]
+    found = {"disturbed_share": 0.0, **json.loads(record.read_text())["config"]}  # older ones lack it
     check_same_settings(found, config.identity(), f"{root} is a dataset", "give another --root or remove it")
     return True
 

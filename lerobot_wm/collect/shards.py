@@ -44,6 +44,7 @@ class EpisodeRecord:
         episode: Its number within the task.
         variation: The variation it was collected on.
         moved: Whether the expert failed on the planned variation, so that this is another one.
+        disturbed: Whether it begins after a disturbance.
         attempt: Number of failures on this variation before it.
         seed: Entropy of the noise's np.random.SeedSequence.
         length: Number of frames.
@@ -53,6 +54,7 @@ class EpisodeRecord:
     episode: int
     variation: int
     moved: bool
+    disturbed: bool
     attempt: int
     seed: list[int]
     length: int
@@ -117,6 +119,7 @@ class Shard:
     variation_set: int
     variations: tuple[int, ...]
     noise: float
+    disturbed_share: float
     steps_after_success: int
     max_attempts: int
     seed: int
@@ -198,12 +201,15 @@ def _succeed(shard: Shard, episode: int, simulation: Simulation, record: ShardRe
         for attempt in range(shard.max_attempts):
             seed = [shard.seed, task_id(shard.task), variation, episode, attempt]
             rng = np.random.default_rng(np.random.SeedSequence(seed))
-            demonstration = demonstrate(simulation, variation, shard.noise, shard.steps_after_success, rng)
+            disturbed = shard.disturbed_share > 0 and rng.random() < shard.disturbed_share
+            demonstration = demonstrate(
+                simulation, variation, shard.noise, shard.steps_after_success, rng, disturbed=disturbed
+            )
             if demonstration is not None:
                 length = len(demonstration.actions)
                 moved = variation != order[0]
                 record.episodes.append(
-                    EpisodeRecord(shard.task, episode, variation, moved, attempt, seed, length)
+                    EpisodeRecord(shard.task, episode, variation, moved, disturbed, attempt, seed, length)
                 )
                 return demonstration
             record.failures[variation] = record.failures.get(variation, 0) + 1
