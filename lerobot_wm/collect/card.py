@@ -40,6 +40,7 @@ def push_demonstrations(dataset: LeRobotDataset, record: dict[str, Any], private
         versions=record["versions"],
         tasks=tasks,
         n_episodes=dataset.num_episodes,
+        n_disturbed=sum(episode.get("disturbed", False) for episode in episodes),
         n_frames=dataset.num_frames,
         fps=dataset.fps,
         fingerprint=dataset_fingerprint(Path(dataset.root)),

@@ -51,8 +51,8 @@ class CollectConfig:
     variation_set: int = REPORTED_VARIATION_SET
     # Standard deviation of the Gaussian noise added to the expert's clipped actions.
     noise: float = 0.3
-    # Share of episodes that begin in the middle, after the hand was moved away and dropped what it held: they show the
-    # policy how to come back, and objects at further places.
+    # Share of attempts that begin in the middle, after the hand was moved away and dropped what it held: they show the
+    # policy how to come back, and objects at further places. They fail more often, so fewer episodes begin so.
     disturbed_share: float = 0.0
     # Steps kept after the first success, so that successful observations are in the data.
     steps_after_success: int = 8

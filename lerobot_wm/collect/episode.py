@@ -40,6 +40,7 @@ class Demonstration:
     Attributes:
         task: Its task.
         variation: Its variation.
+        disturbed: Whether it begins after a disturbance.
         physics: (T, n) simulator states at o_t, for drawing.
         states: (T, 39) Meta-World's full states.
         actions: (T, 4) float32 in [-1, 1].
@@ -49,6 +50,7 @@ class Demonstration:
 
     task: str
     variation: int
+    disturbed: bool
     physics: np.ndarray
     states: np.ndarray
     actions: np.ndarray
@@ -99,6 +101,7 @@ def demonstrate(
     return Demonstration(
         task=simulation.task,
         variation=variation,
+        disturbed=n_before > 0,
         physics=np.array(physics),
         states=np.array(states),
         actions=np.array(actions),

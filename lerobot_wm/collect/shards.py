@@ -44,20 +44,20 @@ class EpisodeRecord:
         episode: Its number within the task.
         variation: The variation it was collected on.
         moved: Whether the expert failed on the planned variation, so that this is another one.
-        disturbed: Whether it begins after a disturbance.
         attempt: Number of failures on this variation before it.
         seed: Entropy of the noise's np.random.SeedSequence.
         length: Number of frames.
+        disturbed: Whether it begins after a disturbance.
     """
 
     task: str
     episode: int
     variation: int
     moved: bool
-    disturbed: bool
     attempt: int
     seed: list[int]
     length: int
+    disturbed: bool = False  # not in records of older collections
 
 
 @dataclass
@@ -206,10 +206,17 @@ def _succeed(shard: Shard, episode: int, simulation: Simulation, record: ShardRe
                 simulation, variation, shard.noise, shard.steps_after_success, rng, disturbed=disturbed
             )
             if demonstration is not None:
-                length = len(demonstration.actions)
-                moved = variation != order[0]
                 record.episodes.append(
-                    EpisodeRecord(shard.task, episode, variation, moved, disturbed, attempt, seed, length)
+                    EpisodeRecord(
+                        task=shard.task,
+                        episode=episode,
+                        variation=variation,
+                        moved=variation != order[0],
+                        attempt=attempt,
+                        seed=seed,
+                        length=len(demonstration.actions),
+                        disturbed=demonstration.disturbed,
+                    )
                 )
                 return demonstration
             record.failures[variation] = record.failures.get(variation, 0) + 1

@@ -34,7 +34,7 @@ class RepairConfig:
 
 
 def repair(repo_id: str, root: Path, output_root: Path) -> None:
-    """Write a copy in version 3, with `timestamp` = `frame_index` / fps and with all columns that number frames.
+    """Write a copy in version 3, with `timestamp` = place in the episode / fps and with all columns that number frames.
 
     `index` is counted again. Other numbers that are there are kept.
 
@@ -88,18 +88,20 @@ def _number_frames(root: Path) -> None:
         table = pq.read_table(path)
         lengths = rows["length"]
         frame = np.concatenate([np.arange(length) for length in lengths])
+        if len(table) != len(frame):
+            continue  # `open_dataset` names what is wrong
         numbers = {
             "frame_index": frame,
             "episode_index": np.repeat(rows["episode_index"], lengths),
             "index": np.repeat(rows["dataset_from_index"], lengths) + frame,
             "task_index": np.repeat([tasks[of_episode[0]] for of_episode in rows["tasks"]], lengths),
         }
-        if "index" in table.column_names and len(table) == len(frame):
+        if "index" in table.column_names:
             table = table.drop_columns("index")
         for name, values in numbers.items():
-            if name not in table.column_names and len(table) == len(values):
+            if name not in table.column_names:
                 table = table.append_column(name, pa.array(np.asarray(values, np.int64)))
-        times = (table["frame_index"].to_numpy() / info["fps"]).astype(np.float32)
+        times = (frame / info["fps"]).astype(np.float32)
         if "timestamp" in table.column_names:
             table = table.drop_columns("timestamp")
         write_table_one_row_group_per_episode(table.append_column("timestamp", pa.array(times)), path)

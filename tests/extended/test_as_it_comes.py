@@ -252,6 +252,8 @@ def test_frames_may_be_counted_from_any_number(tmp_path: Path) -> None:
     small(root)
     set_column(root, "frame_index", [t + 30 for length in (6, 9, 7) for t in range(length)])
     open_dataset(NAME, root)
+    write_wall_clock(root)
+    repair(NAME, root, tmp_path / "repaired")
 
 
 @pytest.mark.parametrize("version", ["v2.0", "v2.1"])

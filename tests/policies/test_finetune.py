@@ -129,7 +129,7 @@ def test_latents_and_frozen_backbones_cannot_be_fine_tuned(
     lerobot_wm_command: Callable[..., None],
     tmp_path: Path,
 ) -> None:
-    backbone = tmp_path / "backbone" / "pretrained_model"
+    backbone = tmp_path / "backbone"
     data = f"--dataset.repo_id=test/demos --dataset.root={demos.root}"
     lerobot_wm_command(
         f"init --policy.type=frozen_backbone --policy.device=cpu {data} --output_dir={backbone}"
