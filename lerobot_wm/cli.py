@@ -34,7 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "quality": ("lerobot_wm.inspect.quality", "how good a world model is on unseen positions"),
     "dream": (
-        "lerobot_wm.inspect.dream_command",
+        "lerobot_wm.inspect.dream",
         "an episode as a world model imagines it -> video and strip",
     ),
     "replay": ("lerobot_wm.inspect.replay", "how far a policy is from recorded actions, without a robot"),

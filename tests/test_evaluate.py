@@ -25,8 +25,7 @@ from lerobot_wm import cli
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.evaluate import rollouts
 from lerobot_wm.evaluate.command import evaluate
-from lerobot_wm.evaluate.config import BatchedEvalConfig, EvaluateConfig, variation_of
-from lerobot_wm.evaluate.rollouts import TaskRunner
+from lerobot_wm.evaluate.rollouts import BatchedEvalConfig, EvaluateConfig, TaskRunner, variation_of
 from lerobot_wm.evaluate.wandb_log import training_config
 from lerobot_wm.policies.common import checkpoint
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig

@@ -12,8 +12,8 @@ from lerobot_wm.constants import ACTION_DIM
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig
-from lerobot_wm.rl.agent import IQLAgent
 from lerobot_wm.rl.bc import bc_loss
+from lerobot_wm.rl.iql import IQLAgent
 
 
 def iql(folder: Path, batch: int, seconds: float) -> Prepared:

@@ -19,8 +19,7 @@ from rich.console import Console
 from tqdm import tqdm
 
 from lerobot_wm.constants import EVAL_INFO_NAME
-from lerobot_wm.evaluate.config import EvaluateConfig
-from lerobot_wm.evaluate.rollouts import TaskRunner, task_names
+from lerobot_wm.evaluate.rollouts import EvaluateConfig, TaskRunner, task_names
 from lerobot_wm.evaluate.wandb_log import log_evaluation, wandb_run
 from lerobot_wm.files import appears_whole
 from lerobot_wm.policies.common.checkpoint import open_checkpoint

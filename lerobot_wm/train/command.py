@@ -24,8 +24,7 @@ from lerobot_wm.files import sole_writer
 from lerobot_wm.policies.common.checkpoint import open_checkpoint, read_config, read_json
 from lerobot_wm.policies.common.checks import check_fit, check_reads, dataset_cameras, rename_command
 from lerobot_wm.policies.common.config import PolicyConfig
-from lerobot_wm.policies.common.features import policy_features
-from lerobot_wm.policies.common.names import names_given_by
+from lerobot_wm.policies.common.features import names_given_by, policy_features
 from lerobot_wm.policies.common.tasks import only_episodes
 from lerobot_wm.policies.latent.config import LatentPolicyConfig, open_world_model
 from lerobot_wm.system import keep_freed_memory

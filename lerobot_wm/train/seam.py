@@ -22,7 +22,7 @@ from lerobot_wm.data.loader import RamLoader, batches_of_rows
 from lerobot_wm.policies.common.card import TrainingData, model_card
 from lerobot_wm.policies.common.checks import check_fit
 from lerobot_wm.policies.common.config import PolicyConfig
-from lerobot_wm.policies.common.names import names_before
+from lerobot_wm.policies.common.features import names_before
 
 # How long processes wait for the one that decodes or encodes. The default is minutes.
 _PATIENCE = timedelta(days=1)

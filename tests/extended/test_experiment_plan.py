@@ -17,7 +17,7 @@ from lerobot_wm.commands.init import InitConfig
 from lerobot_wm.commands.relabel import RelabelConfig
 from lerobot_wm.constants import MT6
 from lerobot_wm.encode.command import EncodeConfig
-from lerobot_wm.evaluate.config import EvaluateConfig
+from lerobot_wm.evaluate.rollouts import EvaluateConfig
 from lerobot_wm.experiment.experiment import report_command
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import load_preset, select_runs, write_settings

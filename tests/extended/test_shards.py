@@ -19,8 +19,7 @@ from lerobot_wm.collect.merge import merge_datasets
 from lerobot_wm.collect.shards import SHARD_RECORD
 from lerobot_wm.data.cache import CACHE_VARIABLE
 from lerobot_wm.data.latents import LatentRecord
-from lerobot_wm.encode.batches import episode_batches, filter_batches
-from lerobot_wm.encode.dataset import encode, encode_job
+from lerobot_wm.encode.dataset import encode, encode_job, episode_batches, filter_batches
 from lerobot_wm.policies.latent.policy import load_encoder
 from lerobot_wm.system import quiet
 from lerobot_wm.workers import Job

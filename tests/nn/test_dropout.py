@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_wm.nn.fast_cpu import Dropout
+from lerobot_wm.nn.mlp import Dropout
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

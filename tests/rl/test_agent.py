@@ -4,7 +4,7 @@ from torch import Tensor
 
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.rl import iql
-from lerobot_wm.rl.agent import IQLAgent
+from lerobot_wm.rl.iql import IQLAgent
 
 OBSERVATION_DIM, ACTION_DIM, BATCH = 6, 2, 32
 

@@ -2,8 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from lerobot_wm.nn.conv import ConvDecoder, ConvEncoder, make_decoder
-from lerobot_wm.nn.fast_cpu import UpsamplingConv
+from lerobot_wm.nn.conv import ConvDecoder, ConvEncoder, UpsamplingConv, make_decoder
 
 
 def test_decoder_equals_its_transposed_convolutions() -> None:

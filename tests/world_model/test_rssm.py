@@ -6,8 +6,7 @@ from torch import Tensor
 
 from lerobot_wm.policies.common.config import default_dtype
 from lerobot_wm.world_model.config import RSSMConfig
-from lerobot_wm.world_model.losses import reconstruction_loss, world_model_loss
-from lerobot_wm.world_model.model import WorldModel
+from lerobot_wm.world_model.model import WorldModel, reconstruction_loss, world_model_loss
 from lerobot_wm.world_model.rssm import DiagonalNormal
 
 ACTION_DIM = 2

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from lerobot_wm.constants import ACTION, OBS_STATE
 from lerobot_wm.data.tables import frames_on_disk
 from lerobot_wm.policies.common.acting_config import ActingConfig
-from lerobot_wm.policies.common.features import Statistics, statistics
-from lerobot_wm.policies.common.names import recorded_name
+from lerobot_wm.policies.common.features import Statistics, recorded_name, statistics
 
 
 class RelativeToState(nn.Module):

@@ -17,8 +17,14 @@ from lerobot_wm.constants import ACTION, OBS_IMAGES, OBS_LATENT, OBS_STATE
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.tasks import all_tasks, resolve_tasks, task_description, tasks_of_one_description
 from lerobot_wm.policies.common.config import PolicyConfig, check_cameras_present, train_new
-from lerobot_wm.policies.common.features import image_keys, policy_features
-from lerobot_wm.policies.common.names import OWN_NAMES, current_names, names_before, renamed
+from lerobot_wm.policies.common.features import (
+    OWN_NAMES,
+    current_names,
+    image_keys,
+    names_before,
+    policy_features,
+    renamed,
+)
 from lerobot_wm.policies.common.tasks import check_tasks
 
 logger = logging.getLogger(__name__)

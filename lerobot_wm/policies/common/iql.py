@@ -15,7 +15,7 @@ from lerobot_wm.policies.common.acting_config import ActingConfig
 from lerobot_wm.policies.common.acting_policy import ActingPolicy
 from lerobot_wm.policies.common.config import compiled
 from lerobot_wm.policies.common.optim import ActorCosineConfig
-from lerobot_wm.rl.agent import IQLAgent
+from lerobot_wm.rl.iql import IQLAgent
 
 NEVER = "never"  # for `done_key`
 # The next.* columns that LeRobot's processors let through; others are read from the dataset by frame index.

@@ -21,8 +21,7 @@ from lerobot_wm.policies.common.card import TrainingData, model_card
 from lerobot_wm.policies.common.checkpoint import WHOLE, CheckpointError, cut_short, not_finite, read_config
 from lerobot_wm.policies.common.checks import check_has_stats, check_names, check_sizes, dataset_cameras
 from lerobot_wm.policies.common.config import PolicyConfig, train_new
-from lerobot_wm.policies.common.features import Statistics
-from lerobot_wm.policies.common.names import current_names
+from lerobot_wm.policies.common.features import Statistics, current_names
 
 logger = logging.getLogger(__name__)
 

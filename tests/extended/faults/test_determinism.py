@@ -16,11 +16,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wm.collect.shards import SHARD_RECORD, Shard, write_shard
 from lerobot_wm.constants import MT6, REPORTED_VARIATION_SET, VARIATION_SETS
-from lerobot_wm.encode.batches import episode_batches, filter_batches
+from lerobot_wm.encode.dataset import episode_batches, filter_batches
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
 from lerobot_wm.envs.metaworld_mt import MetaworldMTEnv
 from lerobot_wm.envs.variations import rand_vec
-from lerobot_wm.evaluate.config import variation_of
+from lerobot_wm.evaluate.rollouts import variation_of
 from lerobot_wm.policies.latent.policy import load_encoder
 from lerobot_wm.records import Record, read_records
 from lerobot_wm.system import quiet

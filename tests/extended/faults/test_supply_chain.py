@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from lerobot_wm.evaluate.config import EvaluateConfig
+from lerobot_wm.evaluate.rollouts import EvaluateConfig
 from tests.documents import ROOT
 
 MODULES = sorted((ROOT / "lerobot_wm").rglob("*.py"))

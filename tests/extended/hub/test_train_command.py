@@ -16,8 +16,8 @@ from lerobot.utils.sample_weighting import SampleWeightingConfig
 
 from lerobot_wm.data.latents import LatentRecord
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
+from lerobot_wm.policies.common.card import train_command
 from lerobot_wm.policies.common.iql import IQLConfig
-from lerobot_wm.policies.common.train_command import train_command
 from lerobot_wm.policies.e2e_bc.configuration_e2e_bc import E2EBCConfig
 from lerobot_wm.policies.wm_bc.configuration_wm_bc import WMBCConfig
 from lerobot_wm.policies.wm_iql.configuration_wm_iql import WMIQLConfig

@@ -13,8 +13,14 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_wm.data.source import SourceConfig
-from lerobot_wm.inspect.dream import HELD_ACTION, OWN_ACTIONS, TRUE_ACTIONS, ZERO_ACTIONS
-from lerobot_wm.inspect.dream_command import DreamConfig, dream_of
+from lerobot_wm.inspect.dream import (
+    HELD_ACTION,
+    OWN_ACTIONS,
+    TRUE_ACTIONS,
+    ZERO_ACTIONS,
+    DreamConfig,
+    dream_of,
+)
 from lerobot_wm.inspect.episodes import CheckpointConfig
 from lerobot_wm.inspect.replay import ReplayConfig, replay
 from tests.recording import camera, record, train_flags, vector

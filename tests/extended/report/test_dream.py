@@ -24,12 +24,13 @@ from lerobot_wm.inspect.dream import (
     STEPS_SHOWN,
     TRUE_ACTIONS,
     ZERO_ACTIONS,
+    DreamConfig,
     Dreams,
     dream,
+    dream_of,
     strip_figure,
     video_frames,
 )
-from lerobot_wm.inspect.dream_command import DreamConfig, dream_of
 from lerobot_wm.inspect.episodes import (
     CheckpointConfig,
     ImaginingPolicy,

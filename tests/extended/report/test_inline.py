@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from lerobot_wm.inspect.pictures import PNG, SVG, figure_bytes
-from lerobot_wm.report.page import split_figure
+from lerobot_wm.report.command import split_figure
 
 
 @pytest.mark.parametrize("mime_type", [PNG, SVG])

@@ -16,8 +16,8 @@ from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.inspect import quality
 from lerobot_wm.inspect.episodes import load_world_model
 from lerobot_wm.inspect.open_loop import WINDOW
+from lerobot_wm.report.command import template_environment
 from lerobot_wm.report.models import read_quality
-from lerobot_wm.report.page import template_environment
 from tests.recording import camera, record, train_flags, vector
 
 
