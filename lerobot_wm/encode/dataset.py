@@ -1,4 +1,7 @@
-"""A latent dataset from an image dataset and a frozen world model, at once or by several jobs."""
+"""A latent dataset from an image dataset and a frozen world model, at once or by several jobs.
+
+Latents of batches of episodes are kept in one file each until all are there: a killed job resumes.
+"""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""Dreams: the world model sees an episode's first frames, then imagines the rest under several kinds of action."""
+"""`lerobot-wm dream`: a world model sees the first frames of an episode and imagines the rest under several actions."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The model card of our policy types: what it is, how it was trained, how well it works, how to use it."""
+"""The model card of our policy types: what it is, how well it works, how to use it and how to train it again."""
 
 import json
 import re
