@@ -215,7 +215,6 @@ def one_shard(folder: Path, **changes: object) -> ShardRecord:
         "variation_set": 42,
         "variations": (9, 0),
         "noise": 0.3,
-        "disturbed_share": 0.0,
         "steps_after_success": 8,
         "max_attempts": 2,
         "seed": 0,
@@ -255,20 +254,3 @@ def test_unknown_names_are_refused_before_work(change: dict[str, str], named: st
     with pytest.raises(ValueError, match=named):
         collect(CollectConfig(repo_id="user/x", root=tmp_path / "dataset", **change))
     assert not any(tmp_path.iterdir())
-
-
-def test_disturbed_episodes_begin_where_the_hand_was_moved_and_dropped_the_puck(tmp_path: Path) -> None:
-    settings = {"task": "pick-place-v3", "count": 6, "variations": (0,), "noise": 0.1, "disturbed_share": 0.5}
-    record = one_shard(tmp_path, **settings)
-    shard = LeRobotDataset("test/shard", root=tmp_path / "pick-place-v3-00000")
-    starts = {False: [], True: []}
-    for index, entry in enumerate(record.episodes):
-        columns = episode(shard, index)
-        starts[entry.disturbed].append(columns[OBS_ENV_STATE][0])
-        assert columns[SUCCESS].any()
-    undisturbed, disturbed = (np.array(starts[key]) for key in (False, True))
-    np.testing.assert_array_equal(undisturbed, undisturbed[:1].repeat(len(undisturbed), 0))
-    hand, puck = slice(0, 3), slice(4, 7)
-    assert (np.linalg.norm(disturbed[:, hand] - undisturbed[0, hand], axis=1) > 0.02).all()
-    assert np.linalg.norm(disturbed[:, puck] - undisturbed[0, puck], axis=1).max() > 0.02
-    assert (disturbed[:, 3] > 0.9).all(), "the gripper is open"

@@ -61,9 +61,6 @@ class CollectConfig:
     variation_set: int = REPORTED_VARIATION_SET
     # Standard deviation of the Gaussian noise added to the expert's clipped actions.
     noise: float = 0.3
-    # Share of attempts that begin in the middle, after the hand was moved away and dropped what it held: they show the
-    # policy how to come back, and objects at further places. They fail more often, so fewer episodes begin so.
-    disturbed_share: float = 0.0
     # Steps kept after the first success, so that successful observations are in the data.
     steps_after_success: int = 8
     # Attempts at a variation before its episode is collected on the next one.
@@ -104,7 +101,6 @@ class CollectConfig:
             "variation_set": self.variation_set,
             "variations": list(parse_variations(self.variations)),
             "noise": self.noise,
-            "disturbed_share": self.disturbed_share,
             "steps_after_success": self.steps_after_success,
             "max_attempts": self.max_attempts,
             "image_size": self.image_size,
@@ -179,8 +175,6 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
     check_variation_set(config.variation_set)
     if config.episodes_per_task < 1:
         raise ValueError(f"--episodes_per_task={config.episodes_per_task}: expected at least 1.")
-    if not 0 <= config.disturbed_share <= 1:
-        raise ValueError(f"--disturbed_share={config.disturbed_share:g}: expected 0 to 1.")
     for description, (first_task, *others) in tasks_of_one_description(tasks).items():
         kept = ",".join(task for task in tasks if task not in others)
         raise ValueError(
@@ -195,7 +189,6 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
             variation_set=config.variation_set,
             variations=variations,
             noise=config.noise,
-            disturbed_share=config.disturbed_share,
             steps_after_success=config.steps_after_success,
             max_attempts=config.max_attempts,
             seed=config.seed,
@@ -215,7 +208,7 @@ def _is_complete(config: CollectConfig, root: Path) -> bool:
         raise FileExistsError(
             f"{root} exists and was not made by `lerobot-wm collect`: give another --root or remove it."
         )
-    found = {"disturbed_share": 0.0, **json.loads(record.read_text())["config"]}  # older ones lack it
+    found = json.loads(record.read_text())["config"]
     check_same_settings(found, config.identity(), f"{root} is a dataset", "give another --root or remove it")
     return True
 
@@ -323,7 +316,6 @@ def push_demonstrations(dataset: LeRobotDataset, record: dict[str, Any], private
         versions=record["versions"],
         tasks=tasks,
         n_episodes=dataset.num_episodes,
-        n_disturbed=sum(episode.get("disturbed", False) for episode in episodes),
         n_frames=dataset.num_frames,
         fps=dataset.fps,
         fingerprint=dataset_fingerprint(Path(dataset.root)),

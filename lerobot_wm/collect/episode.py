@@ -29,9 +29,6 @@ from lerobot_wm.envs.rendering import Renderer
 from lerobot_wm.envs.simulation import Simulation
 from lerobot_wm.envs.tasks import expert_name, task_description, task_id
 
-# A disturbance: at most so many steps of the expert and of carrying, then so many of letting go.
-_EXPERT_STEPS, _CARRY_STEPS, _RELEASE_STEPS = 80, 20, 15
-
 
 @dataclass
 class Demonstration:
@@ -40,7 +37,6 @@ class Demonstration:
     Attributes:
         task: Its task.
         variation: Its variation.
-        disturbed: Whether it begins after a disturbance.
         physics: (T, n) simulator states at o_t, for drawing.
         states: (T, 39) Meta-World's full states.
         actions: (T, 4) float32 in [-1, 1].
@@ -50,7 +46,6 @@ class Demonstration:
 
     task: str
     variation: int
-    disturbed: bool
     physics: np.ndarray
     states: np.ndarray
     actions: np.ndarray
@@ -65,26 +60,20 @@ def demonstrate(
     steps_after_success: int,
     rng: np.random.Generator,
     max_steps: int = MAX_EPISODE_STEPS,
-    *,
-    disturbed: bool = False,
 ) -> Demonstration | None:
     """Let the task's scripted expert try a variation; None if it has not succeeded after `max_steps` steps.
 
     The expert's raw actions reach +-12. They are clipped to [-1, 1], Gaussian noise of standard deviation `noise` is
     added, and the sum is clipped again. The episode continues for `steps_after_success` steps after the first success:
     without them it would have no successful observation, because step t ends in o_{t+1}.
-
-    With `disturbed` it begins in the middle, after the hand has been moved away and has dropped what it held. These
-    steps are not recorded, but count towards `max_steps`.
     """
     expert = getattr(metaworld.policies, expert_name(simulation.task))()
-    state, n_before = (
-        _disturb(simulation, variation, expert, noise, rng) if disturbed else (simulation.reset(variation), 0)
-    )
+    state = simulation.reset(variation)
     physics, states, actions, dense_rewards, successes = [], [], [], [], []
     last_step = max_steps
-    for t in range(max_steps - n_before):
-        action = _noisy_action(expert, state, noise, rng)
+    for t in range(max_steps):
+        action = np.clip(expert.get_action(state), -1.0, 1.0)
+        action = np.clip(action + rng.normal(0.0, noise, action.shape), -1.0, 1.0).astype(np.float32)
         physics.append(simulation.save())
         states.append(state)
         result = simulation.step(action)
@@ -101,39 +90,12 @@ def demonstrate(
     return Demonstration(
         task=simulation.task,
         variation=variation,
-        disturbed=n_before > 0,
         physics=np.array(physics),
         states=np.array(states),
         actions=np.array(actions),
         dense_rewards=np.array(dense_rewards),
         successes=np.array(successes),
     )
-
-
-def _noisy_action(expert: Any, state: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
-    action = np.clip(expert.get_action(state), -1.0, 1.0)
-    return np.clip(action + rng.normal(0.0, noise, action.shape), -1.0, 1.0).astype(np.float32)
-
-
-def _disturb(
-    simulation: Simulation, variation: int, expert: Any, noise: float, rng: np.random.Generator
-) -> tuple[np.ndarray, int]:
-    """Let the expert work for a while, then carry what it holds away in a random direction and drop it.
-
-    Returns:
-        The state, and the number of steps taken. Where the task is solved by then, those of an undisturbed start.
-    """
-    state = simulation.reset(variation)
-    n_expert, n_carry = (int(rng.integers(most + 1)) for most in (_EXPERT_STEPS, _CARRY_STEPS))
-    for _ in range(n_expert):
-        state = simulation.step(_noisy_action(expert, state, noise, rng)).state
-    direction = rng.uniform(-1.0, 1.0, 3)
-    for t in range(n_carry + _RELEASE_STEPS):
-        gripper = 1.0 if t < n_carry else -1.0
-        result = simulation.step(np.append(direction, gripper))
-    if result.success:
-        return simulation.reset(variation), 0
-    return result.state, n_expert + n_carry + _RELEASE_STEPS
 
 
 def dataset_frames(

@@ -47,7 +47,6 @@ class EpisodeRecord:
         attempt: Number of failures on this variation before it.
         seed: Entropy of the noise's np.random.SeedSequence.
         length: Number of frames.
-        disturbed: Whether it begins after a disturbance.
     """
 
     task: str
@@ -57,7 +56,6 @@ class EpisodeRecord:
     attempt: int
     seed: list[int]
     length: int
-    disturbed: bool = False  # not in records of older collections
 
 
 @dataclass
@@ -119,7 +117,6 @@ class Shard:
     variation_set: int
     variations: tuple[int, ...]
     noise: float
-    disturbed_share: float
     steps_after_success: int
     max_attempts: int
     seed: int
@@ -201,10 +198,7 @@ def _succeed(shard: Shard, episode: int, simulation: Simulation, record: ShardRe
         for attempt in range(shard.max_attempts):
             seed = [shard.seed, task_id(shard.task), variation, episode, attempt]
             rng = np.random.default_rng(np.random.SeedSequence(seed))
-            disturbed = shard.disturbed_share > 0 and rng.random() < shard.disturbed_share
-            demonstration = demonstrate(
-                simulation, variation, shard.noise, shard.steps_after_success, rng, disturbed=disturbed
-            )
+            demonstration = demonstrate(simulation, variation, shard.noise, shard.steps_after_success, rng)
             if demonstration is not None:
                 record.episodes.append(
                     EpisodeRecord(
@@ -215,7 +209,6 @@ def _succeed(shard: Shard, episode: int, simulation: Simulation, record: ShardRe
                         attempt=attempt,
                         seed=seed,
                         length=len(demonstration.actions),
-                        disturbed=demonstration.disturbed,
                     )
                 )
                 return demonstration

@@ -44,9 +44,7 @@ def files(root: Path) -> dict[str, bytes]:
 def test_collection(tmp_path: Path) -> None:
     shards = []
     for drawn, seed in enumerate((0, 0, 1)):
-        shard = Shard(
-            "reach-v3", 0, 2, REPORTED_VARIATION_SET, (0, 1), 0.3, 0.5, 2, 1, seed, 32, ("corner2",)
-        )
+        shard = Shard("reach-v3", 0, 2, REPORTED_VARIATION_SET, (0, 1), 0.3, 2, 1, seed, 32, ("corner2",))
         draw(drawn)
         with quiet():
             write_shard(shard, tmp_path / str(drawn))

@@ -54,7 +54,7 @@ def test_data_is_refused_when_it_is_collected(tmp_path: Path, monkeypatch: pytes
         return outcome._replace(dense_reward=math.inf) if outcome.success else outcome
 
     monkeypatch.setattr(Simulation, "step", unstable)
-    shard = Shard("reach-v3", 7, 1, 42, (0,), 0.0, 0.0, 2, 1, 0, 32, ("corner2",))
+    shard = Shard("reach-v3", 7, 1, 42, (0,), 0.0, 2, 1, 0, 32, ("corner2",))
     with pytest.raises(
         ValueError, match=r"reach-v3, episode 7, variation 0, frame \d+: next.dense_reward is not finite"
     ):
