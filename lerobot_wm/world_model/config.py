@@ -30,8 +30,7 @@ class RSSMConfig:
             reacted to, however small it is in the image. 0 removes the head.
         image_shift: Largest random shift of a training frame before it is encoded, in pixels; the reconstruction target
             is not shifted. With demonstrations of few goals, the model could recognize each one by its exact pixels;
-            under shifts it has to locate the goal. Not for actions that are positions in a fixed camera's image: the
-            shift would move the position but not the action.
+            under shifts it has to locate the goal.
         predict_reward: Whether there is a reward head. Turned off for datasets without a reward.
         use_proprio: Encode and reconstruct proprioception beside the image (the variant that the paper discarded).
         image_size: Height and width S of the images that the model sees, a multiple of 16; the paper's is 64. Time and
