@@ -28,6 +28,8 @@ class RSSMConfig:
             wm_rssm replaces it by 0.5 for data whose last action predicts the next, such as joint targets.
         action_scale: Weight of the action loss. A head predicts a_t from s_t, so that s_t holds what the demonstrator
             reacted to, however small it is in the image. 0 removes the head.
+        action_horizon: Number K of actions a_t ... a_{t+K-1} that this head predicts. A target of the joints is almost
+            where the arm is seen to be; the targets of half a second later tell where the object lies.
         image_shift: Largest random shift of a training frame before it is encoded, in pixels; the reconstruction target
             is not shifted. With demonstrations of few goals, the model could recognize each one by its exact pixels;
             under shifts it has to locate the goal.
@@ -52,6 +54,7 @@ class RSSMConfig:
     decode_share: float = 1.0
     hidden_action_share: float | None = None
     action_scale: float = 0.0
+    action_horizon: int = 1
     image_shift: int = 0
     predict_reward: bool = True
     use_proprio: bool = False
@@ -69,6 +72,8 @@ class RSSMConfig:
             raise ValueError(f"image_size is {self.image_size}; expected a multiple of 16, at least 32.")
         if self.min_std <= 0:
             raise ValueError(f"min_std is {self.min_std:g}; expected a standard deviation above 0.")
+        if self.action_horizon < 1:
+            raise ValueError(f"action_horizon is {self.action_horizon}; expected at least 1 action.")
         for name in ("kl_scale", "free_nats", "reward_scale", "action_scale", "image_shift"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name):g}; expected 0 or more.")

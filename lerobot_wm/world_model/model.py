@@ -39,7 +39,8 @@ class WorldModel(LatentModel):
         if config.predict_reward:
             self.reward_head = MLP(config.latent_dim, [config.reward_hidden_dim] * 2, 1)
         if config.action_scale > 0:
-            self.action_head = MLP(config.latent_dim, [config.hidden_dim] * 2, config.action_dim)
+            n_predicted = config.action_horizon * config.action_dim
+            self.action_head = MLP(config.latent_dim, [config.hidden_dim] * 2, n_predicted)
         if config.use_proprio:
             self.proprio_scaling = Affine(config.proprio_dim)
             self.proprio_fusion = MLP(embed_dim + config.proprio_dim, [embed_dim], embed_dim)
@@ -149,8 +150,9 @@ class WorldModel(LatentModel):
 
         Args:
             images: (B, T, C, S, S) in [0, 1].
-            actions: a_t, (B, T, A) in the dataset's units.
-            valid: (B, T) bool, False where a window runs past the end of its episode.
+            actions: a_t, (B, T+K-1, A) in the dataset's units: those of the window, and with an `action_horizon` of K
+                K-1 more for the action loss.
+            valid: (B, T+K-1) bool, False where a window runs past the end of its episode.
             rewards: r_t, (B, T); needed with `config.predict_reward`.
             proprio: (B, T, P); needed with `config.use_proprio`.
 
@@ -158,7 +160,8 @@ class WorldModel(LatentModel):
             The scalar loss, and its parts by name as detached scalars.
         """
         embeds = self.embed(self._shift_images(images), proprio)
-        states, posterior = self._observe(embeds, self._previous_actions(actions), sample=True)
+        length = images.shape[1]
+        states, posterior = self._observe(embeds, self._previous_actions(actions[:, :length]), sample=True)
         prior = self.rssm.prior(states.deter)
         latents = states.latent  # (B, T, D+S)
         # Computed before the action head filters again: compiled for a GPU, that call may overwrite the posterior.
@@ -170,12 +173,12 @@ class WorldModel(LatentModel):
                 self.proprio_decoder(latents), self.proprio_scaling(proprio)
             )
         if self.config.action_scale > 0:
-            errors["action_loss"] = self._action_loss(embeds, latents, self.action_scaling(actions))
+            errors["action_loss"] = self._action_loss(embeds, latents, self.action_scaling(actions), valid)
         if rewards is not None and self.config.predict_reward:
             # s_t predicts r_{t-1}: the first frame of a window has no reward to predict.
             reward_error = (self.predict_reward(latents[:, 1:]) - rewards[:, :-1].float()).square()
             errors["reward_loss"] = nn.functional.pad(reward_error, (1, 0))
-        return world_model_loss(errors, kl, valid, self.config)
+        return world_model_loss(errors, kl, valid[:, :length], self.config)
 
     def _decode(self, latents: Tensor) -> Tensor:
         """Decode latents (..., D+S) to images (..., C, S, S) in float32, not clipped."""
@@ -200,8 +203,10 @@ class WorldModel(LatentModel):
         error = reconstruction_loss(decoded, images[window, frame])  # (B, few)
         return error.new_zeros(windows, length).scatter(1, frame, error * length / few)
 
-    def _action_loss(self, embeds: Tensor, latents: Tensor, actions: Tensor) -> Tensor:
-        """Compute the error (B, T) of scaled actions a_t (B, T, A), predicted from s_t and from frame t alone.
+    def _action_loss(self, embeds: Tensor, latents: Tensor, actions: Tensor, valid: Tensor) -> Tensor:
+        """Compute the error (B, T) of scaled actions a_t ... a_{t+K-1}, predicted from s_t and from frame t alone.
+
+        It is their mean, over those of the K in the episode: actions (B, T+K-1, A), valid (B, T+K-1).
 
         A demonstrator's next action resembles the last one, which the memory holds. A single frame has no memory: to
         predict the action from it, the encoder has to look.
@@ -209,11 +214,13 @@ class WorldModel(LatentModel):
         frames = embeds.flatten(0, 1).unsqueeze(1)  # (B·T, 1, E), each as the first frame of an episode
         unknown = frames.new_zeros(len(frames), 1, self.config.action_dim)
         alone = self.rssm.observe(frames, unknown, self.rssm.initial_state(len(frames)), sample=True)[0]
+        targets = actions.unfold(1, self.config.action_horizon, 1).mT  # (B, T, K, A)
+        known = valid.unfold(1, self.config.action_horizon, 1).float()  # (B, T, K)
         from_memory, from_frame = (
-            reconstruction_loss(self.action_head(each), actions)
+            (self.action_head(each).float().view_as(targets) - targets).square().sum(-1)  # (B, T, K)
             for each in (latents, alone.latent.view_as(latents))
         )
-        return 0.5 * (from_memory + from_frame)
+        return 0.5 * ((from_memory + from_frame) * known).sum(-1) / known.sum(-1).clamp(min=1)
 
     def _shift_images(self, images: Tensor) -> Tensor:
         """Shift each frame of images (B, T, C, S, S) by up to `image_shift` pixels, in training only."""

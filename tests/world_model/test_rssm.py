@@ -224,6 +224,26 @@ def test_action_loss_makes_the_latent_hold_what_was_acted_on() -> None:
     assert not hasattr(make_world_model(), "action_head")
 
 
+def test_action_loss_predicts_the_coming_actions_of_the_episode() -> None:
+    model = make_world_model(action_scale=1.0, action_horizon=3, predict_reward=False)
+    images, actions = two_lamps(2, 4, seed=0)
+    actions = torch.cat([actions, torch.full((2, 2, ACTION_DIM), 5.0)], dim=1)  # (2, T+K-1, A)
+    valid = torch.ones(2, 6, dtype=torch.bool)
+
+    def action_loss(actions: Tensor, valid: Tensor) -> float:
+        torch.manual_seed(0)
+        return model.loss(images, actions, valid)[1]["action_loss"].item()
+
+    padded = valid.clone()
+    padded[:, 4:] = False
+    other = actions.clone()
+    other[:, 4:] = -7.0
+    assert action_loss(actions, valid) != action_loss(other, valid), "actions after the window count"
+    assert action_loss(actions, padded) == action_loss(other, padded), "padding does not"
+    with pytest.raises(ValueError, match="action_horizon is 0"):
+        RSSMConfig(action_horizon=0)
+
+
 def test_image_shift_moves_what_is_encoded_and_not_what_is_reconstructed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -69,8 +69,8 @@ class WMRSSMConfig(WorldModelConfig):
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """Frames of a window, relative to its first."""
-        return list(range(self.window_length))
+        """Frames of a window and those after it whose actions are predicted, relative to its first."""
+        return list(range(self.window_length + self.rssm.action_horizon - 1))
 
     @property
     def reward_delta_indices(self) -> list[int]:

@@ -60,8 +60,9 @@ class WMRSSMPolicy(WorldModelPolicy):
         """The world-model loss on a batch of windows.
 
         Args:
-            batch: Each camera (B, T, C, H, W) in [0, 1], `action` (B, T, A), `action_is_pad` (B, T), and
-                `next.reward` (B, T) or `index` (B,), `observation.state` (B, T, P) where the configuration uses them.
+            batch: Each camera (B, T, C, H, W) in [0, 1], `action` (B, T+K-1, A) with an `action_horizon` of K,
+                `action_is_pad` (B, T+K-1), and `next.reward` (B, T) or `index` (B,), `observation.state` (B, T, P)
+                where the configuration uses them.
 
         Returns:
             The scalar loss, and its parts by name.
@@ -71,6 +72,6 @@ class WMRSSMPolicy(WorldModelPolicy):
             images=camera_images(batch, config.cameras, config.image_size),
             actions=batch[ACTION],
             valid=~batch[f"{ACTION}_is_pad"],
-            rewards=self.rewards(batch, batch[ACTION].shape[1]) if self._learns_reward else None,
+            rewards=self.rewards(batch, config.window_length) if self._learns_reward else None,
             proprio=join_vectors(batch, config.proprio_vectors),
         )
