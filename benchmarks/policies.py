@@ -74,19 +74,20 @@ class Task:
 def ours(share: float, world_model: str, policy: str) -> list[Training]:
     """A world model, and wm_bc on it; `share` of the time goes into the world model."""
     return [
-        Training(f"--policy.type=wm_rssm --batch_size=16 {world_model}", share),
+        Training(f"--policy.type=wm_rssm {SMALL_BATCHES} {world_model}", share),
         Training(
-            f"--policy.type=wm_bc --policy.world_model_path={{previous}} --batch_size=256 {policy}", 1 - share
+            "--policy.type=wm_bc --policy.world_model_path={previous} --policy.lr_decay_share=0.5 --batch_size=256 "
+            f"{policy}",
+            1 - share,
         ),
     ]
 
 
-WORLD_MODEL = (
-    "--policy.rssm.standardize_images=true --policy.rssm.decode_share=0.2 --policy.rssm.kl_scale=0.3"
+SMALL_BATCHES = (
+    "--batch_size=4 --policy.window_length=16 --policy.rssm.standardize_images=true "
+    "--policy.rssm.decode_share=0.2 --policy.rssm.action_scale=2000"
 )
-CHUNKS = (
-    "--policy.head=flow --policy.chunk_size=16 --policy.n_action_steps=8 --policy.hidden_dims='[512,512,512]'"
-)
+WIDE = "--policy.hidden_dims='[512,512,512]'"
 # ImageNet's weights come from the network, and Diffusion Policy on PushT was published without them.
 SCRATCH = "--policy.pretrained_backbone_weights=null"
 ACT = [Training(f"--policy.type=act --batch_size=8 {SCRATCH}", program="lerobot-train")]
@@ -101,7 +102,12 @@ TASKS = {
     "pusht": Task(
         "--env.type=pusht --eval.batch_size=25",
         {
-            "wm_bc": ours(0.5, f"{WORLD_MODEL} --policy.rssm.action_scale=2000", CHUNKS),
+            "wm_bc": ours(
+                0.6,
+                "--policy.rssm.kl_scale=0.1 --policy.rssm.image_shift=2 --policy.rssm.action_horizon=16 "
+                "--policy.lr_decay_share=0.5",
+                f"--policy.head=flow --policy.chunk_size=16 --policy.n_action_steps=8 {WIDE}",
+            ),
             "act": ACT,
             "diffusion": DIFFUSION,
         },
@@ -109,14 +115,29 @@ TASKS = {
     "aloha": Task(
         "--env.type=aloha --env.task=AlohaTransferCube-v0 --eval.batch_size=1",
         {
-            "wm_bc": ours(0.8, f"{WORLD_MODEL} --policy.rssm.action_scale=2000", CHUNKS),
+            "wm_bc": ours(
+                0.85,
+                "--policy.rssm.kl_scale=0.3 --policy.rssm.hidden_action_share=0.5 --policy.rssm.image_shift=2 "
+                "--policy.rssm.action_horizon=32 --policy.lr_decay_share=0.2",
+                f"--policy.chunk_size=32 --policy.n_action_steps=16 {WIDE}",
+            ),
             "act": ACT,
             "diffusion": DIFFUSION,
         },
     ),
     "mt10": Task(
-        "--env.type=metaworld_mt --env.task=mt10 --eval.batch_size=5",
-        {"wm_bc": ours(0.8, WORLD_MODEL, ""), "act": ACT, "diffusion": DIFFUSION},
+        "--env.type=metaworld_mt --env.task=mt10 --env.camera_name=hand_top,hand_side,gripperPOV "
+        "--env.episode_length=500 --eval.batch_size=5",
+        {
+            "wm_bc": ours(
+                0.85,
+                "--policy.rssm.kl_scale=0.3 --policy.rssm.reward_scale=100 --policy.rssm.hidden_action_share=0.5 "
+                "--policy.rssm.image_shift=4 --policy.lr_decay_share=0.2",
+                "",
+            ),
+            "act": ACT,
+            "diffusion": DIFFUSION,
+        },
     ),
 }
 
