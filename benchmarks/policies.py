@@ -4,8 +4,7 @@
 
 The demonstrations of PushT are made by examples/pusht_human.py, those of ALOHA by examples/record_env.py, those of MT10
 by `lerobot-wm collect`. A short run of each training tells how long it takes to start and how long a step takes, and so
-how many steps fit into the time. Everything is written to outputs/policies/<task>; a repeated command keeps policies
-that are done.
+how many steps fit. Everything is written to outputs/policies/<task>, and a repeated command keeps what is done.
 Diffusion Policy needs `pip install 'diffusers>=0.38,<0.40'`.
 """
 
@@ -14,6 +13,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -198,9 +198,18 @@ def step_seconds(output: str) -> float:
     return float(update) + float(data)
 
 
-def train(training: Training, flags: str, minutes: float, threads: int, folder: Path) -> Run:
-    """Train for about so many minutes, including the start and what comes before the first step."""
+def train(training: Training, flags: str, minutes: float, threads: int, folder: Path) -> dict[str, Any]:
+    """Train for about so many minutes, including the start and what comes before the first step.
+
+    Returns:
+        The `Run` without its output, from `folder`.json if that training was done before.
+    """
+    done = folder.with_suffix(".json")
+    if done.exists():
+        return json.loads(done.read_text())
     command = f"{training.program} {training.flags} {flags}"
+    for path in (folder, Path(f"{folder}_pilot")):  # of a training that was stopped
+        shutil.rmtree(path, ignore_errors=True)
     pilot = run(
         f"{command} --steps={PILOT_STEPS} --log_freq={PILOT_STEPS // 2} --save_checkpoint=false "
         f"--output_dir={folder}_pilot",
@@ -211,11 +220,14 @@ def train(training: Training, flags: str, minutes: float, threads: int, folder: 
     begin = pilot.seconds - PILOT_STEPS * step
     steps = max(1, int((60 * minutes - begin) / step))
     print(f"{folder.name}: {begin:.0f} s to start, {step:.3f} s a step: {steps} steps", flush=True)
-    return run(
+    whole = run(
         f"{command} --steps={steps} --save_freq={steps} --output_dir={folder}",
         threads,
         folder.with_name(f"{folder.name}.log"),
     )
+    record = {key: value for key, value in asdict(whole).items() if key != "output"}
+    write_whole(done, json.dumps(record, indent=2) + "\n")
+    return record
 
 
 def latency(checkpoint: Path, root: Path) -> dict[str, float]:
@@ -271,11 +283,9 @@ def measure(task: Task, policy: str, arguments: argparse.Namespace, folder: Path
     infos = json.loads((evaluation / "eval_info.json").read_text())["per_task"]
     return {
         "policy": policy,
-        "trainings": [
-            {key: value for key, value in asdict(each).items() if key != "output"} for each in runs
-        ],
-        "minutes": sum(each.seconds for each in runs) / 60,
-        "memory_gb": max(each.memory_gb for each in runs),
+        "trainings": runs,
+        "minutes": sum(each["seconds"] for each in runs) / 60,
+        "memory_gb": max(each["memory_gb"] for each in runs),
         "latency_ms": latency(previous, arguments.root),
         "successes": [bool(each) for info in infos for each in info["metrics"]["successes"]],
         "max_rewards": [float(each) for info in infos for each in info["metrics"]["max_rewards"]],
