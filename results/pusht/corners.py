@@ -31,6 +31,7 @@ from lerobot_wm.inspect.episodes import filter_episodes, load_world_model, rssm_
 from lerobot_wm.nn.conv import ConvEncoder
 from lerobot_wm.nn.images import camera_images
 from lerobot_wm.nn.mlp import MLP
+from lerobot_wm.nn.normalize import Affine
 
 CAMERA = "observation.image"
 BOARD, SIZE = 512, 64  # pixels of the board, in which corners are given, and of the images
@@ -57,7 +58,7 @@ def fit(model: nn.Module, batch: Any, steps: int) -> None:
 
 
 def print_errors(predicted: Tensor, episodes: list[Episode]) -> None:
-    """The median error of held-out corners (frames, 16), in pixels of the board of 512, by time in the episode."""
+    """Print the median error of predicted corners (frames, 16) in pixels of the board, by time in the episode."""
     error = (predicted - corners_of(episodes)).abs().mean(1)  # (frames,)
     frame = torch.cat([torch.arange(len(each)) for each in episodes])
     held_out = is_held_out(episodes)
@@ -80,38 +81,30 @@ def read(arguments: argparse.Namespace, episodes: list[Episode]) -> None:
     policy = load_world_model(arguments.world_model)
     latents = torch.cat([each.latents for each in filter_episodes(rssm_of(policy), episodes)])  # (frames, L)
     corners, learned = corners_of(episodes), torch.nonzero(~is_held_out(episodes)).flatten()
-    inputs, targets = (Scaling(each) for each in (latents, corners))
+    inputs, targets = standard_scaling(latents), standard_scaling(corners)
     model = MLP(latents.shape[1], [512, 512], corners.shape[1], nn.ReLU)
 
     def batch() -> tuple[Tensor, Tensor]:
         chosen = learned[torch.randint(len(learned), (256,))]
-        return inputs.scale(latents[chosen]), targets.scale(corners[chosen])
+        return inputs(latents[chosen]), targets(corners[chosen])
 
     fit(model, batch, arguments.steps)
     model.eval()
 
     @torch.inference_mode()
     def corners_at(latent: Tensor) -> Tensor:
-        return targets.unscale(model(inputs.scale(latent)))
+        return targets.inverse(model(inputs(latent)))
 
     print_errors(corners_at(latents), episodes)
     if arguments.state_policy:
         act(policy, load_policy(arguments.state_policy), corners_at, arguments.n_episodes)
 
 
-class Scaling:
+def standard_scaling(samples: Tensor) -> Affine:
     """To zero mean and unit variance of samples (N, D)."""
-
-    def __init__(self, samples: Tensor) -> None:
-        self.mean, self.std = samples.mean(0), samples.std(0) + 1e-3
-
-    def scale(self, x: Tensor) -> Tensor:
-        """Scale (N, D)."""
-        return (x - self.mean) / self.std
-
-    def unscale(self, x: Tensor) -> Tensor:
-        """Undo `scale`."""
-        return x * self.std + self.mean
+    scaling = Affine(samples.shape[1])
+    scaling.set_standard(samples.mean(0), samples.std(0))
+    return scaling
 
 
 def load_policy(path: str) -> Any:
@@ -157,7 +150,7 @@ def learn(arguments: argparse.Namespace, episodes: list[Episode]) -> None:
     corners, learned = corners_of(episodes), torch.nonzero(~is_held_out(episodes)).flatten()
     encoder = ConvEncoder(3)
     model = nn.Sequential(encoder, MLP(encoder.embed_dim, [256, 256], corners.shape[1], nn.ReLU))
-    targets, shift = Scaling(corners), arguments.shift
+    targets, shift = standard_scaling(corners), arguments.shift
 
     def batch() -> tuple[Tensor, Tensor]:
         chosen = learned[torch.randint(len(learned), (64,))]
@@ -168,11 +161,11 @@ def learn(arguments: argparse.Namespace, episodes: list[Episode]) -> None:
             for image, (x, y) in zip(padded, offsets.tolist(), strict=True)
         ]
         moved = corners[chosen] + BOARD / SIZE * offsets.repeat(1, corners.shape[1] // 2)
-        return torch.stack(shifted) - 0.5, targets.scale(moved)
+        return torch.stack(shifted) - 0.5, targets(moved)
 
     fit(model, batch, arguments.steps)
     with torch.inference_mode():
-        print_errors(targets.unscale(torch.cat([model(each - 0.5) for each in images.split(256)])), episodes)
+        print_errors(targets.inverse(torch.cat([model(each - 0.5) for each in images.split(256)])), episodes)
 
 
 def main() -> None:
