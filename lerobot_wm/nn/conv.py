@@ -80,6 +80,38 @@ class ConvEncoder(nn.Module):
         return features.flatten(1)
 
 
+class KeypointEncoder(nn.Module):
+    """Convolutions whose every output map tells where it found its thing: image -> coordinates.
+
+    The softmax over each map of S/4 x S/4 places gives a mean place, its keypoint (Finn et al. 2016, "Deep spatial
+    autoencoders"). When an object moves, keypoints move along, wherever it is. Flattened features have other weights
+    for each place, and say nothing of places that no training image showed.
+    """
+
+    places: Tensor
+
+    def __init__(self, image_channels: int, image_size: int, n_keypoints: int) -> None:
+        super().__init__()
+        self.embed_dim = 2 * n_keypoints
+        layers: list[nn.Module] = []
+        for c_in, c_out, kernel, stride in ((image_channels, 32, 4, 2), (32, 64, 4, 2), (64, 64, 3, 1)):
+            conv = nn.Conv2d(c_in, c_out, kernel, stride, padding=1)
+            layers += [conv, nn.GroupNorm(1, c_out), nn.ReLU(inplace=True)]
+        self.layers = nn.Sequential(*layers, nn.Conv2d(64, n_keypoints, kernel_size=1))
+        self.register_buffer("places", torch.linspace(-1, 1, image_size // 4), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Map images (N, C, S, S) to the columns and rows of K keypoints, -1 to 1: (N, 2K)."""
+        maps = self.layers(images.contiguous(memory_format=torch.channels_last))  # (N, K, S/4, S/4)
+        return mean_places(maps.float(), self.places)
+
+
+def mean_places(maps: Tensor, places: Tensor) -> Tensor:
+    """The mean column and row of each map's softmax: maps (N, K, P, P), coordinates of places (P,) -> (N, 2K)."""
+    share = maps.flatten(2).softmax(-1).view_as(maps)
+    return torch.cat([share.sum(2) @ places, share.sum(3) @ places], dim=-1)
+
+
 class ConvDecoder(nn.Module):
     """Linear to 1024, then four transposed convolutions (kernels 5, 5, 6, 6, stride 2): latent -> 64x64 image."""
 
@@ -107,14 +139,20 @@ class ConvDecoder(nn.Module):
 
 
 class DoublingDecoder(nn.Module):
-    """Linear to a map of S/16 x S/16, then four transposed convolutions that double it: latent -> SxS image."""
+    """Linear to a map of S/16 x S/16, then four transposed convolutions that double it: latent -> SxS image.
 
-    def __init__(self, latent_dim: int, image_channels: int, image_size: int) -> None:
+    With `normalize`, each of them follows a GroupNorm.
+    """
+
+    def __init__(
+        self, latent_dim: int, image_channels: int, image_size: int, normalize: bool = False
+    ) -> None:
         super().__init__()
         self.side = image_size // _HALVINGS
         self.input = nn.Linear(latent_dim, _CHANNELS[-1] * self.side**2)
         layers: list[nn.Module] = []
         for c_in, c_out in pairwise((*reversed(_CHANNELS), image_channels)):
+            layers += [nn.GroupNorm(1, c_in)] if normalize else []
             layers += [
                 nn.ReLU(inplace=True),
                 nn.ConvTranspose2d(c_in, c_out, kernel_size=4, stride=2, padding=1),
@@ -127,8 +165,15 @@ class DoublingDecoder(nn.Module):
         return self.layers(hidden.contiguous(memory_format=torch.channels_last))
 
 
-def make_decoder(latent_dim: int, image_channels: int, image_size: int) -> nn.Module:
-    """The paper's decoder for 64x64, and one that doubles for other sizes."""
-    if image_size == PAPER_SIZE:
+def make_encoder(image_channels: int, image_size: int, n_keypoints: int) -> ConvEncoder | KeypointEncoder:
+    """The paper's encoder, or one of keypoints."""
+    if n_keypoints:
+        return KeypointEncoder(image_channels, image_size, n_keypoints)
+    return ConvEncoder(image_channels, image_size)
+
+
+def make_decoder(latent_dim: int, image_channels: int, image_size: int, n_keypoints: int) -> nn.Module:
+    """The paper's decoder for 64x64, and one that doubles for other sizes and for keypoints."""
+    if image_size == PAPER_SIZE and not n_keypoints:
         return ConvDecoder(latent_dim, image_channels)
-    return DoublingDecoder(latent_dim, image_channels, image_size)
+    return DoublingDecoder(latent_dim, image_channels, image_size, normalize=n_keypoints > 0)

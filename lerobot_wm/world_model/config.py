@@ -33,6 +33,8 @@ class RSSMConfig:
         image_shift: Largest random shift of a training frame before it is encoded, in pixels; the reconstruction target
             is not shifted. With demonstrations of few goals, the model could recognize each one by its exact pixels;
             under shifts it has to locate the goal.
+        n_keypoints: Number of keypoints that the encoder looks for; e_t is their coordinates, and the decoder is
+            normalized. 0 flattens feature maps, as in the paper.
         predict_reward: Whether there is a reward head. Turned off for datasets without a reward.
         use_proprio: Encode and reconstruct proprioception beside the image (the variant that the paper discarded).
         image_size: Height and width S of the images that the model sees, a multiple of 16; the paper's is 64. Time and
@@ -56,6 +58,7 @@ class RSSMConfig:
     action_scale: float = 0.0
     action_horizon: int = 1
     image_shift: int = 0
+    n_keypoints: int = 0
     predict_reward: bool = True
     use_proprio: bool = False
     image_size: int = 64
@@ -74,7 +77,7 @@ class RSSMConfig:
             raise ValueError(f"min_std is {self.min_std:g}; expected a standard deviation above 0.")
         if self.action_horizon < 1:
             raise ValueError(f"action_horizon is {self.action_horizon}; expected at least 1 action.")
-        for name in ("kl_scale", "free_nats", "reward_scale", "action_scale", "image_shift"):
+        for name in ("kl_scale", "free_nats", "reward_scale", "action_scale", "image_shift", "n_keypoints"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name):g}; expected 0 or more.")
 

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_wm.nn.conv import ConvEncoder, make_decoder
+from lerobot_wm.nn.conv import make_decoder, make_encoder
 from lerobot_wm.nn.images import random_crop
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
@@ -29,10 +29,11 @@ class WorldModel(LatentModel):
     def __init__(self, config: RSSMConfig) -> None:
         super().__init__()
         self.config = config
-        self.encoder = ConvEncoder(config.image_channels, config.image_size)
+        image = config.image_channels, config.image_size, config.n_keypoints
+        self.encoder = make_encoder(*image)
         embed_dim = self.encoder.embed_dim
         self.rssm = RSSM(config, embed_dim)
-        self.decoder = make_decoder(config.latent_dim, config.image_channels, config.image_size)
+        self.decoder = make_decoder(config.latent_dim, *image)
         self.action_scaling = Affine(config.action_dim)
         if config.standardize_images:
             self.image_scaling = Affine(config.image_channels)

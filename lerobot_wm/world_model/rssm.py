@@ -2,7 +2,8 @@
 
 Layers follow TorchRL's Dreamer (the paper's base), itself Dreamer V1 (Hafner et al. 2019):
 prior Linear(z+a → H) ELU → GRU → Linear ELU → Linear(2S); posterior Linear(d+e → H) ELU → Linear(2S);
-std = max(softplus(·), min_std).
+std = max(softplus(·), min_std). With keypoints the posterior's mean is Linear(e), so that z tells in the same way at
+every place where things are; its std is as above.
 """
 
 from dataclasses import dataclass
@@ -62,7 +63,8 @@ class RSSM(nn.Module):
         self.prior_hidden = nn.Linear(deter, hidden)
         self.prior_params = nn.Linear(hidden, 2 * stoch)
         self.posterior_hidden = nn.Linear(deter + embed_dim, hidden)
-        self.posterior_params = nn.Linear(hidden, 2 * stoch)
+        self.posterior_params = nn.Linear(hidden, stoch if config.n_keypoints else 2 * stoch)
+        self.posterior_mean = nn.Linear(embed_dim, stoch) if config.n_keypoints else None
 
     def initial_state(self, batch_size: int) -> RSSMState:
         """Make the all-zero state from which every sequence starts, (B, ·)."""
@@ -88,13 +90,19 @@ class RSSM(nn.Module):
             from_action = self._action_input(prev_actions)  # (B, T, H)
             d_weight, e_weight = self.posterior_hidden.weight.split([self.deter_dim, embeds.shape[-1]], 1)
             from_embed = F.linear(embeds.float(), e_weight, self.posterior_hidden.bias)  # (B, T, H)
+            linear = None if self.posterior_mean is None else self.posterior_mean(embeds.float())  # (B, T, S)
 
             d, z = state.deter, state.stoch
             deters, stochs, means, stds = [], [], [], []
-            for step_action, step_embed in zip(from_action.unbind(1), from_embed.unbind(1), strict=True):
+            for t, (step_action, step_embed) in enumerate(
+                zip(from_action.unbind(1), from_embed.unbind(1), strict=True)
+            ):
                 d = self._advance(d, z, step_action)  # (B, D)
                 hidden = F.elu(F.linear(d, d_weight) + step_embed)  # (B, H)
-                posterior = self._normal(self.posterior_params(hidden))  # (B, S)
+                params = self.posterior_params(hidden)  # (B, 2S), with keypoints (B, S)
+                posterior = self._normal(
+                    params if linear is None else torch.cat([linear[:, t], params], dim=-1)
+                )
                 z = posterior.mean
                 if sample:
                     z = z + posterior.std * torch.randn_like(posterior.std)

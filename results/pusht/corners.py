@@ -2,13 +2,14 @@
 
     python results/pusht/corners.py read --world_model=outputs/pusht_wm_small/checkpoints/last/pretrained_model \
         --state_policy=outputs/pusht_state/checkpoints/last/pretrained_model --root=data/pusht_human
-    python results/pusht/corners.py learn --root=data/pusht_human --shift=4
+    python results/pusht/corners.py learn --root=data/pusht_human --n_keypoints=64
 
-`read` learns the block's corners from the latents s_t of nine tenths of the demonstrations, and prints the error on the
-rest. With `--state_policy`, that policy of the full state acts on the corners that were read, in the loop.
+`read` learns the block's corners from the latents s_t of nine tenths of the demonstrations, and prints the error on
+the rest; with `--part` from d_t, z_t or the embedding e_t alone. With `--state_policy`, that policy of the full state
+acts on the corners that were read from s_t, in the loop.
 
-`learn` trains the world model's encoder on the corners instead, with images shifted by up to so many pixels and the
-corners with them.
+`learn` trains the world model's encoder on the corners instead, with flattened features or keypoints, and with images
+shifted by up to `--shift` pixels and the corners with them.
 """
 
 import argparse
@@ -28,10 +29,11 @@ from torch.nn import functional as F
 from lerobot_wm.constants import OBS_ENV_STATE
 from lerobot_wm.encode.episodes import Episode, read_episodes
 from lerobot_wm.inspect.episodes import filter_episodes, load_world_model, rssm_of
-from lerobot_wm.nn.conv import ConvEncoder
+from lerobot_wm.nn.conv import make_encoder
 from lerobot_wm.nn.images import camera_images
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.nn.normalize import Affine
+from lerobot_wm.world_model.model import WorldModel
 
 CAMERA = "observation.image"
 BOARD, SIZE = 512, 64  # pixels of the board, in which corners are given, and of the images
@@ -79,7 +81,7 @@ def corners_of(episodes: list[Episode]) -> Tensor:
 def read(arguments: argparse.Namespace, episodes: list[Episode]) -> None:
     """Read the corners from latents, and perhaps act on what was read."""
     policy = load_world_model(arguments.world_model)
-    latents = torch.cat([each.latents for each in filter_episodes(rssm_of(policy), episodes)])  # (frames, L)
+    latents = part_of(rssm_of(policy), episodes, arguments.part)  # (frames, L)
     corners, learned = corners_of(episodes), torch.nonzero(~is_held_out(episodes)).flatten()
     inputs, targets = standard_scaling(latents), standard_scaling(corners)
     model = MLP(latents.shape[1], [512, 512], corners.shape[1], nn.ReLU)
@@ -98,6 +100,16 @@ def read(arguments: argparse.Namespace, episodes: list[Episode]) -> None:
     print_errors(corners_at(latents), episodes)
     if arguments.state_policy:
         act(policy, load_policy(arguments.state_policy), corners_at, arguments.n_episodes)
+
+
+@torch.inference_mode()
+def part_of(model: WorldModel, episodes: list[Episode], part: str) -> Tensor:
+    """s_t, d_t, z_t or e_t of all episodes, (frames, L)."""
+    if part == "e":
+        return torch.cat([model.embed(each.images()[None])[0] for each in episodes])
+    latents = torch.cat([each.latents for each in filter_episodes(model, episodes)])
+    deter, stoch = latents.split([model.config.deter_dim, model.config.stoch_dim], dim=-1)
+    return {"s": latents, "d": deter, "z": stoch}[part]
 
 
 def standard_scaling(samples: Tensor) -> Affine:
@@ -148,7 +160,7 @@ def learn(arguments: argparse.Namespace, episodes: list[Episode]) -> None:
     """Train the world model's encoder on the corners."""
     images = torch.cat([each.images() for each in episodes])  # (frames, 3, 64, 64) in [0, 1]
     corners, learned = corners_of(episodes), torch.nonzero(~is_held_out(episodes)).flatten()
-    encoder = ConvEncoder(3)
+    encoder = make_encoder(3, SIZE, arguments.n_keypoints)
     model = nn.Sequential(encoder, MLP(encoder.embed_dim, [256, 256], corners.shape[1], nn.ReLU))
     targets, shift = standard_scaling(corners), arguments.shift
 
@@ -176,10 +188,12 @@ def main() -> None:
     commands = parser.add_subparsers(required=True)
     reading = commands.add_parser("read")
     reading.add_argument("--world_model", required=True)
+    reading.add_argument("--part", choices="sdze", default="s")
     reading.add_argument("--state_policy")
     reading.add_argument("--n_episodes", type=int, default=50)
     reading.set_defaults(run=read)
     learning = commands.add_parser("learn")
+    learning.add_argument("--n_keypoints", type=int, default=0)
     learning.add_argument("--shift", type=int, default=0)
     learning.set_defaults(run=learn)
     for each in (reading, learning):

@@ -255,6 +255,30 @@ def test_blind_control_reads_no_image(
     assert (checkpoint / "model.safetensors").stat().st_size < 1_000_000
 
 
+def test_a_policy_without_memory_reads_what_the_current_frame_adds(
+    latents_root: Path,
+    world_model_path: Path,
+    demos: LeRobotDataset,
+    tmp_path: Path,
+    lerobot_wm_command: Callable[..., None],
+) -> None:
+    lerobot_wm_command(
+        f"train --policy.type=wm_bc --policy.world_model_path={world_model_path} --policy.use_memory=false",
+        f"--steps=2 --batch_size=8 {TRAIN_FLAGS} --dataset.repo_id=test/latents --dataset.root={latents_root}",
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    policy = get_policy_class("wm_bc").from_pretrained(tmp_path / "run/checkpoints/last/pretrained_model")
+    assert policy.select_action(frame(demos, 0)).shape == (1, 4)
+    latent = LeRobotDataset("test/latents", root=latents_root)[0]["observation.latent"][None]  # (1, L)
+    state, task = torch.zeros(1, policy.config.state_dim), torch.zeros(1, len(policy.config.tasks))
+    read = policy.observation(state, task, latent)
+    past, present = latent.clone(), latent.clone()
+    past[:, 0] += 1
+    present[:, -1] += 1
+    assert torch.equal(read, policy.observation(state, task, past))
+    assert not torch.equal(read, policy.observation(state, task, present))
+
+
 def test_unknown_task(policy_paths: dict[str, Path], demos: LeRobotDataset) -> None:
     policy = load(policy_paths, "wm_bc")
     with pytest.raises(ValueError, match=r"Unknown task \['Juggle'\].*Reach a goal position"):

@@ -2,7 +2,14 @@ import pytest
 import torch
 from torch import nn
 
-from lerobot_wm.nn.conv import ConvDecoder, ConvEncoder, UpsamplingConv, make_decoder
+from lerobot_wm.nn.conv import (
+    ConvDecoder,
+    ConvEncoder,
+    UpsamplingConv,
+    make_decoder,
+    make_encoder,
+    mean_places,
+)
 
 
 def test_decoder_equals_its_transposed_convolutions() -> None:
@@ -19,11 +26,19 @@ def test_shapes() -> None:
     assert ConvDecoder(16, 6)(torch.zeros(2, 16)).shape == (2, 6, 64, 64)
 
 
+@pytest.mark.parametrize("n_keypoints", [0, 5])
 @pytest.mark.parametrize("size", [32, 64, 80, 128])
-def test_encoder_and_decoder_follow_the_image_size(size: int) -> None:
-    encoder = ConvEncoder(3, size)
+def test_encoder_and_decoder_follow_the_image_size(size: int, n_keypoints: int) -> None:
+    encoder = make_encoder(3, size, n_keypoints)
     assert encoder(torch.zeros(2, 3, size, size)).shape == (2, encoder.embed_dim)
-    assert make_decoder(16, 3, size)(torch.zeros(2, 16)).shape == (2, 3, size, size)
+    assert make_decoder(16, 3, size, n_keypoints)(torch.zeros(2, 16)).shape == (2, 3, size, size)
+
+
+def test_keypoints_are_the_columns_and_rows_of_what_each_map_found() -> None:
+    maps = torch.zeros(1, 3, 5, 5)
+    maps[0, 0, 1, 4] = maps[0, 1, 0, 0] = maps[0, 1, 0, 2] = 50.0  # of the third, every place is equal
+    found = mean_places(maps, torch.linspace(-1, 1, 5))  # (1, 6)
+    torch.testing.assert_close(found, torch.tensor([[1.0, -0.5, 0.0, -0.5, -1.0, 0.0]]))
 
 
 @pytest.mark.parametrize("kernel_size", [5, 6])

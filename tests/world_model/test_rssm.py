@@ -72,8 +72,9 @@ def test_recurrent_state_advances() -> None:
     assert (latents.diff(dim=1).abs().amax(-1) > 1e-6).all()
 
 
-def test_step_by_step_filtering_equals_sequence_filtering() -> None:
-    model = make_world_model()
+@pytest.mark.parametrize("n_keypoints", [0, 8])
+def test_step_by_step_filtering_equals_sequence_filtering(n_keypoints: int) -> None:
+    model = make_world_model(n_keypoints=n_keypoints)
     images, actions = two_lamps(2, 9, seed=1)
     whole = model.filter(images, actions).latent
     state, prev_action = None, torch.zeros(2, 1, ACTION_DIM)
@@ -322,7 +323,21 @@ def test_what_precedes_an_episode_is_the_middle_of_the_actions_range() -> None:
     torch.testing.assert_close(rest.latent, latents[:, 1:])
 
 
-@pytest.mark.parametrize("name", ["kl_scale", "free_nats", "reward_scale", "image_shift", "action_scale"])
+def test_with_keypoints_the_posterior_mean_is_linear_in_what_the_encoder_found() -> None:
+    model = make_world_model(n_keypoints=8)
+    actions = torch.rand(4, 3, ACTION_DIM)
+    one, other = torch.randn(2, 4, 3, 16)
+
+    def mean(embeds: Tensor) -> Tensor:
+        return model.filter_embeds(embeds, actions).stoch
+
+    torch.testing.assert_close(mean((one + other) / 2), (mean(one) + mean(other)) / 2)
+    assert (mean(one)[:, 1:] - mean(one)[:, :1]).abs().max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "name", ["kl_scale", "free_nats", "reward_scale", "image_shift", "action_scale", "n_keypoints"]
+)
 def test_weights_below_zero_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name} is -1"):
         RSSMConfig(**{name: -1.0})

@@ -27,6 +27,8 @@ class LatentPolicyConfig(ActingConfig):
         world_model_path: Folder or Hub id of the checkpoint of a world model (wm_rssm) or of a frozen_backbone in its
             place; its frozen weights become part of this policy's.
         use_latent: False leaves the latent out: the blind control, which reads proprioception and task id only.
+        use_memory: False leaves d_t out of the latent [d_t, z_t]. A policy can recognize demonstrations by what has
+            happened so far, and then fails where nobody has been.
         use_environment_state: True adds the simulator's full state, `observation.environment_state`. With
             `use_latent=false` this is the control that knows the truth. The environment has to provide it.
         save_predicted_video: True lets `lerobot-eval` write a video of each batch of rollouts beside its own
@@ -36,6 +38,7 @@ class LatentPolicyConfig(ActingConfig):
 
     world_model_path: str | None = None
     use_latent: bool = True
+    use_memory: bool = True
     use_environment_state: bool = False
     save_predicted_video: bool = False
     world_model: WorldModelConfig | None = None
@@ -53,8 +56,10 @@ class LatentPolicyConfig(ActingConfig):
 
     @property
     def latent_dim(self) -> int:
-        """Size of s_t; 0 for a policy without latents."""
-        return 0 if self.world_model is None else self.world_model.latent_dim
+        """How many numbers of s_t, its last ones, the policy reads; 0 for a policy without latents."""
+        if self.world_model is None:
+            return 0
+        return self.world_model.latent_dim - (0 if self.use_memory else self.world_model.memory_dim)
 
     @property
     def scales_latents(self) -> bool:

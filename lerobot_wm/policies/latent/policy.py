@@ -61,7 +61,8 @@ class LatentPolicy(ActingPolicy):
                 config.check_latents(dataset_meta)
         super().fit_dataset(stats, dataset_meta)
         if config.scales_latents:
-            self.latent_scaling.set_standard(*statistics(stats, OBS_LATENT, "mean", "std"))
+            mean, std = statistics(stats, OBS_LATENT, "mean", "std")
+            self.latent_scaling.set_standard(mean[-config.latent_dim :], std[-config.latent_dim :])
         if config.use_environment_state:
             self.env_state_scaling.set_standard(*statistics(stats, OBS_ENV_STATE, "mean", "std"))
 
@@ -119,6 +120,7 @@ class LatentPolicy(ActingPolicy):
         """
         inputs = [tasks, self.proprioception(state)]
         if latent is not None:
+            latent = latent[..., -self.config.latent_dim :]
             inputs.insert(0, self.latent_scaling(latent) if self.config.scales_latents else latent)
         if env_state is not None:
             inputs.append(self.env_state_scaling(env_state))

@@ -83,6 +83,11 @@ class WMRSSMConfig(WorldModelConfig):
         return self.rssm.latent_dim
 
     @property
+    def memory_dim(self) -> int:
+        """Size of d_t."""
+        return self.rssm.deter_dim
+
+    @property
     def features_read(self) -> list[str]:
         """Cameras, and proprioception where it is modelled."""
         return [*self.cameras, *(self.state_vectors if self.rssm.use_proprio else [])]

@@ -37,6 +37,11 @@ class WorldModelConfig(PolicyConfig):
     def latent_dim(self) -> int:
         """Size of s_t; a subclass may make it a field."""
 
+    @property
+    def memory_dim(self) -> int:
+        """How many numbers of s_t, its first ones, are of the past: `use_memory=false` leaves them out."""
+        return 0
+
     def validate_features(self) -> None:
         """Choose the cameras.
 
