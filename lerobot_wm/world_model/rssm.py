@@ -100,9 +100,8 @@ class RSSM(nn.Module):
                 d = self._advance(d, z, step_action)  # (B, D)
                 hidden = F.elu(F.linear(d, d_weight) + step_embed)  # (B, H)
                 params = self.posterior_params(hidden)  # (B, 2S), with keypoints (B, S)
-                posterior = self._normal(
-                    params if linear is None else torch.cat([linear[:, t], params], dim=-1)
-                )
+                mean, raw_std = params.chunk(2, dim=-1) if linear is None else (linear[:, t], params)
+                posterior = self._normal(mean, raw_std)
                 z = posterior.mean
                 if sample:
                     z = z + posterior.std * torch.randn_like(posterior.std)
@@ -116,7 +115,7 @@ class RSSM(nn.Module):
     def prior(self, deter: Tensor) -> DiagonalNormal:
         """Predict the distribution of z_t before o_t is seen; deter is d_t, (..., D)."""
         with torch.autocast(deter.device.type, enabled=False):
-            return self._normal(self.prior_params(F.elu(self.prior_hidden(deter))))
+            return self._normal(*self.prior_params(F.elu(self.prior_hidden(deter))).chunk(2, dim=-1))
 
     def imagine(self, state: RSSMState, actions: Tensor) -> RSSMState:
         """Roll the prior forward without images; z_t is the prior's mean.
@@ -148,6 +147,5 @@ class RSSM(nn.Module):
         z_weight = self.recurrent_input.weight[:, : self.stoch_dim]  # (H, S)
         return self.gru(F.elu(F.linear(stoch, z_weight) + from_action), deter)
 
-    def _normal(self, params: Tensor) -> DiagonalNormal:
-        mean, std = params.chunk(2, dim=-1)
-        return DiagonalNormal(mean, F.softplus(std).clamp(min=self.min_std))
+    def _normal(self, mean: Tensor, raw_std: Tensor) -> DiagonalNormal:
+        return DiagonalNormal(mean, F.softplus(raw_std).clamp(min=self.min_std))

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wm.constants import OBS_ENV_STATE
-from lerobot_wm.encode.episodes import Episode, read_episodes
+from lerobot_wm.encode.episodes import Episode, embed_episodes, read_episodes
 from lerobot_wm.inspect.episodes import filter_episodes, load_world_model, rssm_of
 from lerobot_wm.nn.conv import make_encoder
 from lerobot_wm.nn.images import camera_images
@@ -106,7 +106,7 @@ def read(arguments: argparse.Namespace, episodes: list[Episode]) -> None:
 def part_of(model: WorldModel, episodes: list[Episode], part: str) -> Tensor:
     """s_t, d_t, z_t or e_t of all episodes, (frames, L)."""
     if part == "e":
-        return torch.cat([model.embed(each.images()[None])[0] for each in episodes])
+        return torch.cat([embed_episodes(model, [each])[0][0] for each in episodes])
     latents = torch.cat([each.latents for each in filter_episodes(model, episodes)])
     deter, stoch = latents.split([model.config.deter_dim, model.config.stoch_dim], dim=-1)
     return {"s": latents, "d": deter, "z": stoch}[part]
