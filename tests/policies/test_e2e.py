@@ -260,10 +260,12 @@ def test_several_cameras_are_stacked_at_the_first_ones_size() -> None:
 
 
 def test_wrong_options() -> None:
-    with pytest.raises(ValueError, match=r"encoder='vgg'.*small, resnet18, resnet34"):
+    with pytest.raises(ValueError, match=r"encoder='vgg'.*small, keypoints, resnet18, resnet34"):
         make_config("e2e_bc", encoder="vgg")
     with pytest.raises(ValueError, match=r"random_crop_pad=-1"):
         make_config("e2e_bc", random_crop_pad=-1)
+    with pytest.raises(ValueError, match=r"48x32.*encoder_image_size=\[64,64\]"):
+        make_policy("e2e_bc", encoder="keypoints", encoder_image_size=(48, 32))
 
 
 def test_both_training_commands(

@@ -39,6 +39,10 @@ def test_encoder_shapes(
     assert (features.abs() < 1).all()
 
 
+def test_keypoints_give_the_same_number_of_features() -> None:
+    assert ImageEncoder("keypoints", (6, 32, 32))(torch.rand(2, 6, 32, 32)).shape == (2, FEATURE_DIM)
+
+
 @pytest.mark.parametrize("name", ["small", "resnet18"])
 def test_encoder_normalises_by_groups_of_its_own_image_alone(name: str) -> None:
     # BatchNorm, torchvision's default, would tie the images of a batch together.

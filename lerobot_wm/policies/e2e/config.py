@@ -7,7 +7,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_wm.policies.common.acting_config import ActingConfig
 from lerobot_wm.policies.common.features import policy_features
 
-ENCODERS = ("small", "resnet18", "resnet34")
+ENCODERS = ("small", "keypoints", "resnet18", "resnet34")
 
 
 @dataclass
@@ -18,7 +18,8 @@ class E2EConfig(ActingConfig):
     [image features, one-hot task, proprioception].
 
     Args:
-        encoder: "small" (four convolutions), "resnet18" or "resnet34" (PTR's), always trained from scratch.
+        encoder: "small" (four convolutions), "keypoints" (64 of them, for square images; as the world model's
+            `n_keypoints`), "resnet18" or "resnet34" (PTR's), always trained from scratch.
         encoder_image_size: (H, W) that the images of all cameras are resized to, such as '[64,64]'; None takes that of
             the first camera. Time and memory grow with it.
         random_crop_pad: Largest random shift of training images, in pixels; 0 leaves them. PTR: 4.
@@ -55,9 +56,15 @@ class E2EConfig(ActingConfig):
         """Choose the cameras and the image size; the inputs are then the cameras and proprioception.
 
         Raises:
-            ValueError: The cameras cannot be used, `state_keys` are not there, or there is no action.
+            ValueError: The cameras cannot be used, keypoints get images that are not square, `state_keys` are not
+                there, or there is no action.
         """
         self.choose_cameras()
-        self.encoder_image_size = self.image_size
+        self.encoder_image_size = height, width = self.image_size
+        if self.encoder == "keypoints" and height != width:
+            raise ValueError(
+                f"--policy.encoder=keypoints takes square images, but these are {height}x{width}: add "
+                "--policy.encoder_image_size=[64,64]."
+            )
         _ = self.state_dim, self.action_dim
         self.remove_inputs(self.input_features.keys() - {*self.cameras, *self.state_vectors})

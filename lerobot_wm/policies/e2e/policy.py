@@ -7,11 +7,13 @@ import torch
 import torchvision
 from torch import Tensor, nn
 
+from lerobot_wm.nn.conv import KeypointEncoder
 from lerobot_wm.nn.images import camera_images, random_crop
 from lerobot_wm.policies.common.acting_policy import ActingPolicy
 from lerobot_wm.policies.e2e.config import E2EConfig
 
 FEATURE_DIM = 256
+N_KEYPOINTS = 64
 
 _GROUPS = 4
 _SMALL_CHANNELS = 32
@@ -67,22 +69,29 @@ class E2EPolicy(ActingPolicy):
 
 
 class ImageEncoder(nn.Module):
-    """Image -> 256 features in (-1, 1): CNN, learned spatial embeddings, linear, LayerNorm, tanh.
+    """Image -> 256 features in (-1, 1): CNN, learned spatial embeddings or keypoints, linear, LayerNorm, tanh.
 
     Args:
-        name: "small", or torchvision's "resnet18" or "resnet34".
+        name: "small", "keypoints", or torchvision's "resnet18" or "resnet34".
         image_shape: (C, H, W) of the images. The encoder takes no other size.
     """
 
     def __init__(self, name: str, image_shape: tuple[int, int, int]) -> None:
         super().__init__()
-        channels = image_shape[0]
-        self.backbone = _small(channels) if name == "small" else _resnet(name, channels)
-        with torch.no_grad():
-            feature_map = self.backbone(torch.zeros(1, *image_shape))  # (1, C', H', W')
-        self.embeddings = SpatialEmbeddings(*feature_map.shape[1:])
+        channels, size, _ = image_shape
+        self.backbone: nn.Module
+        self.embeddings: nn.Module
+        if name == "keypoints":
+            self.backbone = keypoints = KeypointEncoder(channels, size, N_KEYPOINTS)
+            self.embeddings, n_features = nn.Identity(), keypoints.embed_dim
+        else:
+            self.backbone = _small(channels) if name == "small" else _resnet(name, channels)
+            with torch.no_grad():
+                feature_map = self.backbone(torch.zeros(1, *image_shape))  # (1, C', H', W')
+            self.embeddings = embeddings = SpatialEmbeddings(*feature_map.shape[1:])
+            n_features = embeddings.output_dim
         self.bottleneck = nn.Sequential(
-            nn.Linear(self.embeddings.output_dim, FEATURE_DIM), nn.LayerNorm(FEATURE_DIM), nn.Tanh()
+            nn.Linear(n_features, FEATURE_DIM), nn.LayerNorm(FEATURE_DIM), nn.Tanh()
         )
 
     def forward(self, images: Tensor) -> Tensor:
