@@ -74,7 +74,7 @@ class Task:
 def ours(share: float, world_model: str, policy: str) -> list[Training]:
     """A world model, and wm_bc on it; `share` of the time goes into the world model."""
     return [
-        Training(f"--policy.type=wm_rssm {SMALL_BATCHES} {world_model}", share),
+        Training(f"--policy.type=wm_rssm --policy.rssm.standardize_images=true {world_model}", share),
         Training(
             "--policy.type=wm_bc --policy.world_model_path={previous} --policy.lr_decay_share=0.5 --batch_size=256 "
             f"{policy}",
@@ -84,8 +84,11 @@ def ours(share: float, world_model: str, policy: str) -> list[Training]:
 
 
 SMALL_BATCHES = (
-    "--batch_size=4 --policy.window_length=16 --policy.rssm.standardize_images=true "
-    "--policy.rssm.decode_share=0.2 --policy.rssm.action_scale=2000"
+    "--batch_size=4 --policy.window_length=16 --policy.rssm.decode_share=0.2 --policy.rssm.action_scale=2000"
+)
+KEYPOINTS = (
+    "--batch_size=16 --policy.window_length=4 --policy.rssm.decode_share=0.5 --policy.rssm.action_scale=200 "
+    "--policy.rssm.n_keypoints=64"
 )
 WIDE = "--policy.hidden_dims='[512,512,512]'"
 # ImageNet's weights come from the network, and Diffusion Policy on PushT was published without them.
@@ -103,10 +106,11 @@ TASKS = {
         "--env.type=pusht --eval.batch_size=25",
         {
             "wm_bc": ours(
-                0.6,
-                "--policy.rssm.kl_scale=0.1 --policy.rssm.image_shift=2 --policy.rssm.action_horizon=16 "
+                0.65,
+                f"{KEYPOINTS} --policy.rssm.kl_scale=0.1 --policy.rssm.action_horizon=16 "
                 "--policy.lr_decay_share=0.5",
-                f"--policy.head=flow --policy.chunk_size=16 --policy.n_action_steps=8 {WIDE}",
+                "--policy.use_memory=false --policy.head=flow --policy.chunk_size=16 --policy.n_action_steps=4 "
+                f"{WIDE}",
             ),
             "act": ACT,
             "diffusion": DIFFUSION,
@@ -117,8 +121,8 @@ TASKS = {
         {
             "wm_bc": ours(
                 0.85,
-                "--policy.rssm.kl_scale=0.3 --policy.rssm.hidden_action_share=0.5 --policy.rssm.image_shift=2 "
-                "--policy.rssm.action_horizon=32 --policy.lr_decay_share=0.2",
+                f"{SMALL_BATCHES} --policy.rssm.kl_scale=0.3 --policy.rssm.hidden_action_share=0.5 "
+                "--policy.rssm.image_shift=2 --policy.rssm.action_horizon=32 --policy.lr_decay_share=0.2",
                 f"--policy.chunk_size=32 --policy.n_action_steps=16 {WIDE}",
             ),
             "act": ACT,
@@ -131,8 +135,8 @@ TASKS = {
         {
             "wm_bc": ours(
                 0.85,
-                "--policy.rssm.kl_scale=0.3 --policy.rssm.reward_scale=100 --policy.rssm.hidden_action_share=0.5 "
-                "--policy.rssm.image_shift=4 --policy.lr_decay_share=0.2",
+                f"{SMALL_BATCHES} --policy.rssm.kl_scale=0.3 --policy.rssm.reward_scale=100 "
+                "--policy.rssm.hidden_action_share=0.5 --policy.rssm.image_shift=4 --policy.lr_decay_share=0.2",
                 "",
             ),
             "act": ACT,

@@ -47,11 +47,9 @@ class ActingConfig(PolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("action_noise", "state_noise"):
-            if getattr(self, name) < 0:
-                raise ValueError(
-                    f"--policy.{name}={getattr(self, name):g}: a standard deviation is 0 or more."
-                )
+        for name, value in vars(self).items():
+            if name.endswith("_noise") and value < 0:
+                raise ValueError(f"--policy.{name}={value:g}: a standard deviation is 0 or more.")
 
     @property
     def action_dim(self) -> int:
