@@ -1,4 +1,4 @@
-"""docs/other_environments.md at a size for tests: PushT and ALOHA, from recording to lerobot-eval."""
+"""docs/other_environments.md at a size for tests: PushT and ALOHA, from the dataset to lerobot-eval."""
 
 import json
 import runpy
@@ -50,6 +50,8 @@ def small(words: list[str]) -> list[str]:
         few = with_flags(words, **{"eval.n_episodes": 1, "eval.batch_size": 1})
         return [*few, "--env.episode_length=2", "--policy.device=cpu"]
     few = [*with_flags(words, steps=2, batch_size=2), "--policy.device=cpu", "--num_workers=0"]
+    if "--dataset.repo_id=lerobot/pusht" in words:  # on the Hub
+        few = [*with_flags(few, **{"dataset.repo_id": "test/pusht"}), "--dataset.root=data/pusht"]
     if "--policy.type=wm_rssm" in words:
         few += [*SMALL_WORLD_MODEL.split(), "--policy.window_length=4"]
     return few
@@ -75,6 +77,9 @@ def test_the_commands_work_as_written(
     monkeypatch.chdir(tmp_path)
     chain = [words for words in commands(DOCUMENT) if any(environment in word for word in words[1:])]
     chain = [words for words in chain if words[0] != "pip"]
+    if environment == "pusht":
+        record = "python examples/record_env.py --env.type=pusht --repo_id=test/pusht --root=data/pusht --n_episodes=2"
+        chain.insert(0, record.split())
     assert [words[0] for words in chain] == ["python", "lerobot-wm", "lerobot-wm", "lerobot-eval"]
     for words in map(small, chain):
         if words[0] == "python":
