@@ -31,7 +31,6 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.environments import ROOT
 from benchmarks.measure import THREAD_VARIABLES
 from lerobot_wm.files import write_whole
 from lerobot_wm.policies.common.features import policy_features
@@ -342,7 +341,7 @@ def main() -> None:
     parser.add_argument("--output_dir", type=Path, help="default: outputs/policies/<task>")
     arguments = parser.parse_args()
     task = TASKS[arguments.task]
-    folder = arguments.output_dir or ROOT / "outputs" / "policies" / arguments.task
+    folder = arguments.output_dir or Path("outputs") / "policies" / arguments.task
     rows = []
     for policy in arguments.policies.split(","):
         path = folder / f"{policy}.json"
