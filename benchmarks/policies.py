@@ -110,7 +110,7 @@ TASKS = {
                 0.65,
                 f"{KEYPOINTS} --policy.rssm.kl_scale=0.1 --policy.rssm.action_horizon=16 "
                 "--policy.lr_decay_share=0.5",
-                "--policy.use_memory=false --policy.latent_noise=0.1 --policy.head=flow --policy.chunk_size=16 "
+                "--policy.use_memory=false --policy.head=flow --policy.chunk_size=16 "
                 f"--policy.n_action_steps=4 {WIDE}",
             ),
             "act": ACT,

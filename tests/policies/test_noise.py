@@ -1,4 +1,4 @@
-"""Noise on actions at test time, and on latents and proprioception in training."""
+"""Noise on actions at test time, and on proprioception in training."""
 
 from pathlib import Path
 from typing import Any
@@ -99,20 +99,7 @@ def test_proprioception_has_noise_in_training_alone(demos: LeRobotDataset, polic
     assert not noise[:, :-4].any()
 
 
-def test_latents_have_noise_in_training_alone(policy_paths: dict[str, Path], demos: LeRobotDataset) -> None:
-    policy = load(policy_paths["wm_bc"], "wm_bc", 0)
-    policy.config.latent_noise = STD
-    latent_dim = policy.config.latent_dim
-    state, tasks, latent = torch.zeros(500, 4), torch.zeros(500, 2), torch.zeros(500, latent_dim)
-    policy.eval()
-    exact = policy.observation(state, tasks, latent)
-    policy.train()
-    noise = policy.observation(state, tasks, latent) - exact  # (500, O)
-    assert noise[:, :latent_dim].std().item() == pytest.approx(STD, rel=0.05)
-    assert not noise[:, latent_dim:].any()
-
-
-@pytest.mark.parametrize("setting", ["action_noise", "latent_noise", "state_noise"])
+@pytest.mark.parametrize("setting", ["action_noise", "state_noise"])
 def test_negative_noise_is_refused(setting: str) -> None:
     with pytest.raises(ValueError, match=rf"{setting}=-0.1.*0 or more"):
         get_policy_class("wm_bc").config_class(**{setting: -0.1})

@@ -72,11 +72,10 @@ class ActingPolicy(BasePolicy):
 
     def proprioception(self, state: Tensor) -> Tensor:
         """What the heads read of proprioception (B, P): scaled, and in training with `state_noise`."""
-        return self.with_noise(self.state_scaling(state), self.config.state_noise)
-
-    def with_noise(self, inputs: Tensor, std: float) -> Tensor:
-        """In training, `inputs` with Gaussian noise of this standard deviation; otherwise as they are."""
-        return inputs + std * torch.randn_like(inputs) if self.training and std > 0 else inputs
+        scaled = self.state_scaling(state)
+        if self.training and self.config.state_noise > 0:
+            scaled = scaled + self.config.state_noise * torch.randn_like(scaled)
+        return scaled
 
     def batch_size(self, batch: dict[str, Any]) -> int:
         """B of a batch, in training or at test time."""

@@ -29,9 +29,6 @@ class LatentPolicyConfig(ActingConfig):
         use_latent: False leaves the latent out: the blind control, which reads proprioception and task id only.
         use_memory: False leaves d_t out of the latent [d_t, z_t]. A policy can recognize demonstrations by what has
             happened so far, and then fails where nobody has been.
-        latent_noise: Standard deviation of Gaussian noise on the latent in training. wm_rssm's decoder and heads learn
-            from samples of z_t, whose standard deviation is at least 0.1 (`rssm.min_std`); the policy reads its mean.
-            Noise of this size hides from it what is too weak in z_t to survive sampling.
         use_environment_state: True adds the simulator's full state, `observation.environment_state`. With
             `use_latent=false` this is the control that knows the truth. The environment has to provide it.
         save_predicted_video: True lets `lerobot-eval` write a video of each batch of rollouts beside its own
@@ -42,7 +39,6 @@ class LatentPolicyConfig(ActingConfig):
     world_model_path: str | None = None
     use_latent: bool = True
     use_memory: bool = True
-    latent_noise: float = 0.0
     use_environment_state: bool = False
     save_predicted_video: bool = False
     world_model: WorldModelConfig | None = None

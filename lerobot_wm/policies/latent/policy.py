@@ -116,15 +116,12 @@ class LatentPolicy(ActingPolicy):
             env_state: The simulator's full state, (B, F); given with `use_environment_state`.
 
         Returns:
-            [latent, one-hot task, scaled proprioception, scaled full state], (B, O). In training with `latent_noise`
-            and `state_noise`.
+            [latent, one-hot task, scaled proprioception, scaled full state], (B, O).
         """
         inputs = [tasks, self.proprioception(state)]
         if latent is not None:
             latent = latent[..., -self.config.latent_dim :]
-            if self.config.scales_latents:
-                latent = self.latent_scaling(latent)
-            inputs.insert(0, self.with_noise(latent, self.config.latent_noise))
+            inputs.insert(0, self.latent_scaling(latent) if self.config.scales_latents else latent)
         if env_state is not None:
             inputs.append(self.env_state_scaling(env_state))
         return torch.cat(inputs, dim=-1)
