@@ -26,7 +26,7 @@ from lerobot_wm.constants import CAMERA_NAME, IMAGE_SIZE, REPORTED_VARIATION_SET
 from lerobot_wm.data.latents import dataset_fingerprint
 from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.envs.cameras import parse_cameras
-from lerobot_wm.envs.tasks import expert_name, resolve_tasks, task_description, tasks_of_one_description
+from lerobot_wm.envs.tasks import expert_name, resolve_tasks, task_description
 from lerobot_wm.envs.variations import check_variation_set, parse_variations
 from lerobot_wm.errors import cache_folders, check_can_push
 from lerobot_wm.files import UNFINISHED, appears_whole, check_writable, sole_writer
@@ -169,18 +169,12 @@ def plan_shards(config: CollectConfig) -> list[Shard]:
     """The shards of a collection in the order of the final dataset: by task, then by episode.
 
     Raises:
-        ValueError: There is no such task, variation or camera, or two tasks would become one task of the dataset.
+        ValueError: There is no such task, variation or camera.
     """
     tasks, variations = resolve_tasks(config.tasks), parse_variations(config.variations)
     check_variation_set(config.variation_set)
     if config.episodes_per_task < 1:
         raise ValueError(f"--episodes_per_task={config.episodes_per_task}: expected at least 1.")
-    for description, (first_task, *others) in tasks_of_one_description(tasks).items():
-        kept = ",".join(task for task in tasks if task not in others)
-        raise ValueError(
-            f"{first_task} and {', '.join(others)} have one description, {description!r}, and would become one task of "
-            f"the dataset. Collect {', '.join(others)} into another dataset, and here --tasks={kept}."
-        )
     return [
         Shard(
             task=task,

@@ -83,6 +83,19 @@ def frames_on_disk(meta: LeRobotDatasetMetadata, *keys: str) -> list[Tensor]:
     return [torch.from_numpy(values.astype(np.float32)).view(len(index), -1) for values in columns]
 
 
+def episode_values(meta: LeRobotDatasetMetadata, *keys: str) -> list[list[int]]:
+    """The different values of integer columns in each episode.
+
+    Returns:
+        [episode, value of each column] once each, in order; none where a column is missing, or no table is on this
+        machine.
+    """
+    if not _tables(meta) or not set(keys) <= set(meta.features):
+        return []
+    columns = [values.astype(int) for values in _read_columns(meta, "episode_index", *keys)[1:]]
+    return np.unique(np.stack(columns, axis=1), axis=0).tolist()
+
+
 def _read_columns(meta: LeRobotDatasetMetadata, *keys: str) -> list[np.ndarray]:
     """The index (N,) of the frames on this machine, and the numbers (N * size,) in each column; reads a table once."""
     names = ("index", *keys)

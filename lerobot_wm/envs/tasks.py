@@ -9,6 +9,8 @@ from typing import TypedDict
 
 from lerobot_wm.constants import TASK_SETS
 
+PUSH_BACK_DESCRIPTION = "Push the puck back to a goal"
+
 
 class _TaskTables(TypedDict):
     TASK_DESCRIPTIONS: dict[str, str]
@@ -56,16 +58,8 @@ def resolve_tasks(spec: str) -> tuple[str, ...]:
 
 
 def task_description(task: str) -> str:
-    """LeRobot's description of a task; push-v3 and push-back-v3 share theirs, all others differ."""
-    return _tables()["TASK_DESCRIPTIONS"][task]
-
-
-def tasks_of_one_description(tasks: Iterable[str]) -> dict[str, list[str]]:
-    """Descriptions that several of these tasks share, each with its tasks: a policy cannot tell them apart."""
-    by_description: dict[str, list[str]] = {}
-    for task in tasks:
-        by_description.setdefault(task_description(task), []).append(task)
-    return {description: sharing for description, sharing in by_description.items() if len(sharing) > 1}
+    """The sentence by which policies tell tasks apart: LeRobot's, but for push-back-v3, to which it gives push-v3's."""
+    return PUSH_BACK_DESCRIPTION if task == "push-back-v3" else _tables()["TASK_DESCRIPTIONS"][task]
 
 
 def task_id(task: str) -> int:

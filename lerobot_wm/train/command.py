@@ -199,6 +199,7 @@ def train(cfg: TrainPipelineConfig) -> None:
             check_can_push(cfg.policy.repo_id)
         check_login(cfg)
     with (
+        only_episodes(cfg.dataset.episodes),
         sole_writer(cfg.output_dir) if processes.is_main_process else nullcontext(),
         explain_how_to_resume(cfg.output_dir),
     ):
@@ -213,7 +214,6 @@ def train(cfg: TrainPipelineConfig) -> None:
             train_log(cfg.output_dir),
             damaged_tables_named(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision),
             names_given_by(cfg.rename_map),
-            only_episodes(cfg.dataset.episodes),
         ):
             train_from_memory(cfg)
 

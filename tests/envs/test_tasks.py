@@ -36,11 +36,11 @@ def test_names_equal_lerobots() -> None:
 
     assert set(all_tasks()) == set(metaworld.ALL_V3_ENVIRONMENTS)
     for task in all_tasks():
-        assert task_description(task) == lerobot_metaworld.TASK_DESCRIPTIONS[task]
+        if task != "push-back-v3":
+            assert task_description(task) == lerobot_metaworld.TASK_DESCRIPTIONS[task]
         assert task_id(task) == lerobot_metaworld.TASK_NAME_TO_ID[task]
         assert expert_name(task) == lerobot_metaworld.TASK_POLICY_MAPPING[task].__name__
-    shared = [task for task in all_tasks() if task_description(task) == task_description("push-v3")]
-    assert sorted(shared) == ["push-back-v3", "push-v3"]
+    assert len({task_description(task) for task in all_tasks()}) == 50
 
 
 @pytest.mark.parametrize("variation_set", VARIATION_SETS)

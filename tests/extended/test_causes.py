@@ -3,12 +3,15 @@
 import getpass
 import json
 import pwd
+import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import datasets
 import httpx
+import numpy as np
 import pandas as pd
 import pytest
 import wandb
@@ -18,14 +21,14 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_policy_config
 
 from lerobot_wm.cli import expand_home
-from lerobot_wm.collect.command import CollectConfig, collect, plan_shards
+from lerobot_wm.collect.command import CollectConfig, collect
 from lerobot_wm.commands.doctor import check_folder
 from lerobot_wm.data.cache import CACHE_VARIABLE, cache_root
 from lerobot_wm.data.check import DatasetError, read_file
 from lerobot_wm.data.source import open_dataset
 from lerobot_wm.encode.dataset import _remove_cameras_from_episodes
 from lerobot_wm.errors import disk_problem, exit_with_one_line
-from lerobot_wm.policies.common.tasks import only_episodes
+from lerobot_wm.policies.common.tasks import only_episodes, tasks_to_learn
 from lerobot_wm.system import name_user, opengl_fix
 from lerobot_wm.train.flags import check_episodes, check_flags, check_login, write_beside_checkpoint
 from lerobot_wm.train.resume import settings_in
@@ -217,15 +220,26 @@ def test_two_datasets_of_one_name_do_not_share_a_cache(
     assert cache_root(tmp_path / "b" / ".." / "a" / "dataset") == first
 
 
-def test_two_tasks_of_one_description_are_not_collected_as_one() -> None:
-    with pytest.raises(ValueError, match="push-back-v3") as error:
-        plan_shards(CollectConfig(repo_id="a/b", tasks="push-v3,reach-v3,push-back-v3"))
-    assert "--tasks=push-v3,reach-v3." in str(error.value)
-    with pytest.raises(ValueError, match="push-back-v3") as error:
-        plan_shards(CollectConfig(repo_id="a/b", tasks="mt50"))
-    kept = str(error.value).partition("--tasks=")[2].rstrip(".")
-    shards = plan_shards(CollectConfig(repo_id="a/b", tasks=kept))
-    assert len({shard.task for shard in shards}) == 49
+def test_two_tasks_of_one_sentence_are_not_learned_as_one(tmp_path: Path) -> None:
+    """In lerobot/metaworld_mt50, push-v3 and push-back-v3 share their sentence and differ in `task_id`."""
+    features = {"observation.state": vector(3), "action": vector(2), "task_id": vector(1, "int16")}
+    episodes = [("Push", 6), ("Reach", 5), ("Push", 7), ("Push", 7)]
+    dataset = record(
+        tmp_path / "dataset",
+        features,
+        episodes,
+        lambda t, length: {"task_id": np.array([length], dtype=np.int16)},
+    )
+    with pytest.raises(
+        ValueError, match="tasks 6 and 7 of the column task_id share the sentence 'Push'"
+    ) as error:
+        tasks_to_learn(dataset.meta)
+    with only_episodes([0, 1]):
+        assert tasks_to_learn(dataset.meta) == ["Push", "Reach"]
+    command = str(error.value).partition("`")[2].partition("`")[0].replace("ANOTHER SENTENCE", "Push back")
+    subprocess.run(shlex.split(command), check=True)
+    dataset = LeRobotDataset(dataset.repo_id, root=dataset.root)
+    assert sorted(tasks_to_learn(dataset.meta)) == ["Push", "Push back", "Reach"]
 
 
 def test_a_policy_knows_the_tasks_that_it_was_trained_on(recorded: LeRobotDataset) -> None:

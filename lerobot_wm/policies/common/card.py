@@ -60,8 +60,7 @@ def eval_command(config: PolicyConfig, repo_id: str) -> str:
 
 def _metaworld_tasks(descriptions: list[str]) -> str | None:
     """The names of the tasks, or of their set, for `--env.task`; None if one is not Meta-World's."""
-    # The first of two tasks that share a description.
-    names = {task_description(name): name for name in reversed(all_tasks())}
+    names = {task_description(name): name for name in all_tasks()}
     if not descriptions or not set(descriptions) <= set(names):
         return None
     tasks = [names[description] for description in descriptions]

@@ -1,7 +1,6 @@
 """Whether a policy fits the dataset it is trained on or the environment it acts in, checked before work starts."""
 
 import json
-import logging
 import shlex
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES, OBS_STR
 
 from lerobot_wm.constants import ACTION, OBS_IMAGES, OBS_LATENT, OBS_STATE
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from lerobot_wm.envs.tasks import all_tasks, resolve_tasks, task_description, tasks_of_one_description
+from lerobot_wm.envs.tasks import resolve_tasks, task_description
 from lerobot_wm.policies.common.config import PolicyConfig, check_cameras_present, train_new
 from lerobot_wm.policies.common.features import (
     OWN_NAMES,
@@ -26,8 +25,6 @@ from lerobot_wm.policies.common.features import (
     renamed,
 )
 from lerobot_wm.policies.common.tasks import check_tasks
-
-logger = logging.getLogger(__name__)
 
 
 def check_fit(
@@ -191,13 +188,4 @@ def _check_environment(config: PolicyConfig, env: EnvConfig, rename_map: Mapping
         return
     check_cameras_present(config, cameras, f"--env.type={env.type} --env.camera_name={env.camera_name}")
     config.check_shapes({key: tuple(feature.shape) for key, feature in features.items()})
-    chosen = resolve_tasks(env.task)
-    check_tasks(config, {task_description(task) for task in chosen})
-    for description, sharing in tasks_of_one_description(all_tasks()).items():
-        if set(sharing) & set(chosen):
-            logger.warning(
-                "%s have one description, %r: only their images tell a policy which one it is in. Evaluate it on the "
-                "one that it was trained on.",
-                " and ".join(sharing),
-                description,
-            )
+    check_tasks(config, {task_description(task) for task in resolve_tasks(env.task)})
