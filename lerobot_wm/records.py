@@ -243,29 +243,46 @@ def run_statistics(records: list[Record]) -> RunStatistics:
     depend on each other (tests/extended/report/test_bootstrap.py measures both). Where a task has one seed, its
     rollouts are resampled: then the interval covers the choice of variations, not the spread between seeds.
     """
-    rng = np.random.default_rng(RNG_SEED)
-    scores, draws, single_run = [], [], False
-    for of_task in group_by_task(records).values():
-        successes: dict[int | None, list[bool]] = {}
-        for record in of_task:
-            successes.setdefault(record["seed"], []).append(record["success"])
-        task_scores = np.array([np.mean(of_seed) for of_seed in successes.values()])  # (R,)
-        if len(task_scores) > 1:
-            task_draws = resample(task_scores, rng)  # (N, R)
-        else:
-            [of_seed] = successes.values()
-            task_draws = resample(np.array(of_seed, float), rng).mean(axis=1, keepdims=True)  # (N, 1)
-            single_run = True
-        scores.append(task_scores)
-        draws.append(task_draws)
+    scores, draws = zip(*_task_scores(records).values(), strict=True)
     all_scores, all_draws = np.concatenate(scores), np.concatenate(draws, axis=1)  # (R·T,), (N, R·T)
     return RunStatistics(
         mean=Estimate(100 * all_scores.mean(), percentile_interval(100 * all_draws.mean(axis=1))),
         iqm=Estimate(
             100 * trim_mean(all_scores, 0.25), percentile_interval(100 * trim_mean(all_draws, 0.25, axis=1))
         ),
-        single_run=single_run,
+        single_run=any(len(of_task) == 1 for of_task in scores),
     )
+
+
+def mean_over_groups(records: list[Record], groups: Iterable[Iterable[str]]) -> Estimate:
+    """Mean over groups of tasks of each group's mean success, with the interval of `run_statistics`.
+
+    Args:
+        records: Of one arm; has all tasks of the groups.
+        groups: Names of tasks.
+    """
+    by_task = _task_scores(records)
+    scores = [np.mean([by_task[task][0].mean() for task in group]) for group in groups]  # (G,)
+    draws = [np.mean([by_task[task][1].mean(axis=1) for task in group], axis=0) for group in groups]  # (G, N)
+    return Estimate(100 * float(np.mean(scores)), percentile_interval(100 * np.mean(draws, axis=0)))
+
+
+def _task_scores(records: list[Record]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Of each task: the scores of an arm's R seeds (R,), and bootstrap draws of them (N_RESAMPLES, R)."""
+    rng = np.random.default_rng(RNG_SEED)
+    by_task = {}
+    for task, of_task in group_by_task(records).items():
+        successes: dict[int | None, list[bool]] = {}
+        for record in of_task:
+            successes.setdefault(record["seed"], []).append(record["success"])
+        scores = np.array([np.mean(of_seed) for of_seed in successes.values()])  # (R,)
+        if len(scores) > 1:
+            draws = resample(scores, rng)  # (N, R)
+        else:
+            [of_seed] = successes.values()
+            draws = resample(np.array(of_seed, float), rng).mean(axis=1, keepdims=True)  # (N, 1)
+        by_task[task] = (scores, draws)
+    return by_task
 
 
 def resample(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import batched
 
 from rich.console import RenderableType
@@ -58,6 +58,12 @@ class ReportTable:
     rows: Sequence[tuple[str, Sequence[Cell]]]
     n_totals: int = 0
     notes: list[str] = field(default_factory=list)
+
+    def transposed(self, corner: str) -> "ReportTable":
+        """Rows as columns, with another corner."""
+        labels, cells = zip(*self.rows, strict=True)
+        rows = list(zip(self.columns, zip(*cells, strict=True), strict=True))
+        return replace(self, corner=corner, columns=list(labels), rows=rows)
 
 
 def table_by_split(title: str, records: list[Record]) -> ReportTable:

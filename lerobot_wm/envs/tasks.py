@@ -15,6 +15,7 @@ PUSH_BACK_DESCRIPTION = "Push the puck back to a goal"
 class _TaskTables(TypedDict):
     TASK_DESCRIPTIONS: dict[str, str]
     TASK_NAME_TO_ID: dict[str, int]
+    DIFFICULTY_TO_TASKS: dict[str, list[str]]
     TASK_POLICY_MAPPING: dict[str, str]
 
 
@@ -60,6 +61,11 @@ def resolve_tasks(spec: str) -> tuple[str, ...]:
 def task_description(task: str) -> str:
     """The sentence by which policies tell tasks apart: LeRobot's, but for push-back-v3, to which it gives push-v3's."""
     return PUSH_BACK_DESCRIPTION if task == "push-back-v3" else _tables()["TASK_DESCRIPTIONS"][task]
+
+
+def tasks_by_tier() -> dict[str, list[str]]:
+    """All 50 tasks by difficulty, from easy to very hard, as LeRobot's page on Meta-World groups them."""
+    return {tier.replace("_", " "): tasks for tier, tasks in _tables()["DIFFICULTY_TO_TASKS"].items()}
 
 
 def task_id(task: str) -> int:

@@ -38,6 +38,7 @@ from lerobot_wm.report.success import (
     paper_comparison,
     seed_table,
     task_table,
+    tier_table,
 )
 from lerobot_wm.report.training import curve_figures, read_logs, summarise_data
 from lerobot_wm.tables import Measurement, ReportTable, cell_text, markdown_table, terminal_tables
@@ -240,7 +241,11 @@ def rollout_sections(records: list[Record], clips: list[Clip]) -> Content:
                 for arm, runs in group_by_arm(records).items()
             ],
             "n_rollouts": len(records),
-            "tables": [task_table("Success per task", records), overall_table(records)],
+            "tables": [
+                *filter(None, [tier_table(records)]),
+                task_table("Success per task", records),
+                overall_table(records),
+            ],
             "detail_tables": _detail_tables(records),
             "paper_table": paper_comparison(records),
             "comparison_tables": comparison_tables(records),

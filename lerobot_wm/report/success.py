@@ -3,12 +3,14 @@
 from dataclasses import dataclass, replace
 
 from lerobot_wm.constants import MT6
+from lerobot_wm.envs.tasks import tasks_by_tier
 from lerobot_wm.records import (
     N_RESAMPLES,
     Record,
     SuccessRate,
     group_by_task,
     is_in_split,
+    mean_over_groups,
     present_splits,
     run_statistics,
     success_rate,
@@ -17,6 +19,7 @@ from lerobot_wm.report.comparison import DENSE_SUFFIX, Comparison, compare_arms,
 from lerobot_wm.tables import WILSON, Cell, ReportTable
 
 ROLLOUTS_PER_CELL = 50
+MAX_TASKS_ACROSS = 10
 
 
 @dataclass(frozen=True)
@@ -70,10 +73,25 @@ COMPARISON_NOTES = [
 
 
 def task_table(title: str, records: list[Record]) -> ReportTable:
-    """Arms down, tasks across."""
+    """Arms down, tasks across; tasks down where there are many."""
     tasks = list(group_by_task(records))
     rows = [(arm, _task_cells(of_arm, tasks)) for arm, of_arm in group_by_arm(records).items()]
-    return ReportTable(title, "arm", tasks, rows, notes=[POOLED])
+    table = ReportTable(title, "arm", tasks, rows, notes=[POOLED])
+    return table if len(tasks) <= MAX_TASKS_ACROSS else table.transposed("task")
+
+
+def tier_table(records: list[Record]) -> ReportTable | None:
+    """Arms down; the four tiers of LeRobot's Meta-World page and their mean across; None without all 50 tasks."""
+    tiers = tasks_by_tier()
+    if set(group_by_task(records)) != {task for tasks in tiers.values() for task in tasks}:
+        return None
+    rows: list[tuple[str, list[Cell]]] = []
+    for arm, of_arm in group_by_arm(records).items():
+        cells = [success_rate(r for r in of_arm if r["task"] in tasks) for tasks in tiers.values()]
+        has_all = len(group_by_task(of_arm)) == sum(map(len, tiers.values()))
+        rows.append((arm, [*cells, mean_over_groups(of_arm, tiers.values()) if has_all else None]))
+    columns = [f"{tier} ({len(tasks)} tasks)" for tier, tasks in tiers.items()]
+    return ReportTable("Tiers of difficulty", "arm", [*columns, "mean of tiers"], rows, notes=[POOLED])
 
 
 def seed_table(records: list[Record]) -> ReportTable:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from lerobot_wm.constants import MT6
+from lerobot_wm.envs.tasks import all_tasks, tasks_by_tier
 from lerobot_wm.records import Estimate, SuccessRate
 from lerobot_wm.report.arms import ARMS
 from lerobot_wm.report.comparison import group_by_arm
@@ -15,6 +16,7 @@ from lerobot_wm.report.success import (
     paper_comparison,
     seed_table,
     task_table,
+    tier_table,
 )
 
 TASKS = {"button-press-topdown-v3": (10, 39), "reach-v3": (4, 15)}
@@ -28,6 +30,29 @@ def test_arms_down_in_a_fixed_order_tasks_across(make_records: Callable) -> None
     assert [arm for arm, _ in table.rows] == ["e2e_bc", "wm_iql", "wm_bc", "proprio_bc", "mine"]
     assert dict(table.rows)["wm_iql"] == [None, SuccessRate(25, 50)]
     assert dict(table.rows)["wm_bc"] == [SuccessRate(49, 50), SuccessRate(19, 50)]
+
+
+def test_many_tasks_go_down(make_records: Callable) -> None:
+    records = make_records("wm_bc", dict.fromkeys(all_tasks(), (4, 15)))
+    table = task_table("Success per task", records)
+    assert (table.corner, table.columns) == ("task", ["wm_bc"])
+    assert dict(table.rows) == dict.fromkeys(all_tasks(), (SuccessRate(19, 50),))
+
+
+def test_the_mean_of_tiers_counts_each_tier_once(make_records: Callable) -> None:
+    """28 easy tasks weigh as much as the 5 very hard ones; single rollouts are resampled within their task."""
+    solved = dict.fromkeys(all_tasks(), (10, 40)) | dict.fromkeys(tasks_by_tier()["very hard"], (0, 25))
+    records = make_records("wm_bc", solved) + make_records("wm_iql", {"reach-v3": (1, 1)})
+    table = tier_table(records)
+    assert table is not None
+    assert table.columns[-2:] == ["very hard (5 tasks)", "mean of tiers"]
+    *tiers, mean = dict(table.rows)["wm_bc"]
+    assert [tier.percent for tier in tiers] == [100, 100, 100, 50]
+    assert mean.percent == pytest.approx(87.5)
+    # 250 rollouts at one half have a deviation of 3.16 points, of which the mean takes a quarter.
+    assert mean.interval == pytest.approx((87.5 - 1.55, 87.5 + 1.55), abs=0.2)
+    assert dict(table.rows)["wm_iql"][-1] is None, "it lacks tasks"
+    assert tier_table(make_records("wm_bc", SIX)) is None
 
 
 def test_unknown_arms_keep_their_order(make_records: Callable) -> None:
