@@ -11,7 +11,7 @@ from typing import IO
 from rich.console import Console
 from rich.table import Column, Table
 
-from lerobot_wm.constants import RECORDS_NAME, REPORTED_VARIATION_SET, VARIATION_SETS
+from lerobot_wm.constants import RECORDS_NAME, VARIATION_SETS
 from lerobot_wm.experiment.plan import Plan
 from lerobot_wm.experiment.preset import CONFIGS, Preset, load_preset, select_runs, write_settings
 from lerobot_wm.experiment.runner import Runner, Times, environment, minutes_left, minutes_text
@@ -73,7 +73,7 @@ class Ledger:
         for record in read_records(found) if found else []:
             if record["preset"] == self._preset.name:
                 runs.setdefault((record["arm"], record["seed"]), []).append(record)
-        rollouts = {(task, k) for task in self._preset.task_names for k in self._preset.variations}
+        rollouts = {(task, k) for task in self._preset.task_names for k in self._preset.rollout_variations}
         return {
             run: records
             for run, records in runs.items()
@@ -135,11 +135,10 @@ class Experiment:
         self.plan = plan
         self.runs = runs
         self.processes = processes
-        suffix = "" if plan.variation_set == REPORTED_VARIATION_SET else f"_set{plan.variation_set}"
-        records = f"records{suffix}.jsonl"
+        records = f"records{plan.suffix}.jsonl"
         self._committed = results_dir / f"{records}.gz"
         self.ledger = Ledger(plan.output_dir / records, self._committed, plan.preset)
-        self.report_dir = plan.output_dir / f"report{suffix}"
+        self.report_dir = plan.output_dir / f"report{plan.suffix}"
         self.times = Times(plan.output_dir / "times.json", plan.preset.minutes)
         self._quality = [plan.quality(runs[0][1])] if quality else []
 
@@ -259,9 +258,8 @@ def make_parser() -> argparse.ArgumentParser:
         "--variation_set",
         type=int,
         choices=VARIATION_SETS,
-        default=REPORTED_VARIATION_SET,
-        help="variations to roll out on: 42 to report, 43 to tune, 44 to confirm; recorded in separate files "
-        "(%(default)s)",
+        help="variations to roll out on, by default the preset's: 42 to report, 43 to tune, 44 to confirm; others are "
+        "recorded in separate files",
     )
     parser.add_argument(
         "--quality", action="store_true", help="also measure the world model's quality (lerobot-wm quality)"
@@ -282,7 +280,7 @@ def main() -> None:
         runs = select_runs(preset, _names(args.arms), [int(seed) for seed in _names(args.seeds)])
         output_dir = args.output_dir or Path("outputs") / preset.name
         results_dir = args.results_dir or Path("results") / preset.name
-        plan = Plan(preset, output_dir, args.variation_set)
+        plan = Plan(preset, output_dir, args.variation_set or preset.variation_set)
         if args.list:
             Experiment(plan, runs, results_dir, args.processes, args.quality).show(console)
             return

@@ -16,7 +16,6 @@ from lerobot.utils.constants import (
 from lerobot_wm.constants import (
     DENSE_REWARD,
     ENV_TYPE,
-    NUM_SEEN_VARIATIONS,
     NUM_VARIATIONS,
     QUALITY_NAME,
     RECORDS_NAME,
@@ -44,12 +43,12 @@ class Plan:
 
     preset: Preset
     output_dir: Path
-    variation_set: int = REPORTED_VARIATION_SET
+    variation_set: int
 
     def demonstrations(self) -> Dataset:
-        """Scripted demonstrations of the seen variations, with the 0/1 reward."""
+        """Scripted demonstrations, with the 0/1 reward."""
         count = self.preset.episodes_per_task
-        return self._collect("dataset", count, NUM_SEEN_VARIATIONS, REPORTED_VARIATION_SET)
+        return self._collect("dataset", count, self.preset.variations, REPORTED_VARIATION_SET)
 
     def dense_demonstrations(self) -> Dataset:
         """The same ones with Meta-World's shaped reward."""
@@ -74,14 +73,14 @@ class Plan:
     def held_out_demonstrations(self) -> Dataset:
         """Demonstrations of variations that nothing is trained on, at most one episode each."""
         count = min(NUM_VARIATIONS, self.preset.episodes_per_task)
-        return self._collect("held_out", count, NUM_VARIATIONS, SELECTION_VARIATION_SET)
+        return self._collect("held_out", count, f"0-{NUM_VARIATIONS - 1}", SELECTION_VARIATION_SET)
 
-    def _collect(self, name: str, count: int, n_variations: int, variation_set: int) -> Dataset:
+    def _collect(self, name: str, count: int, variations: str, variation_set: int) -> Dataset:
         folder, repo_id = self.output_dir / name, f"local/{self.preset.name}_{name}"
         flags = {
             "tasks": self.preset.tasks,
             "episodes_per_task": count,
-            "variations": f"0-{n_variations - 1}",
+            "variations": variations,
             "variation_set": variation_set,
             "noise": self.preset.noise,
             "camera_name": self.preset.camera_name,
@@ -238,7 +237,7 @@ class Plan:
         flags = {
             "tasks": self.preset.tasks,
             "variation_set": self.variation_set,
-            "variations": ",".join(map(str, self.preset.variations)),
+            "variations": ",".join(map(str, self.preset.rollout_variations)),
             "episode_length": self.preset.episode_length,
             "output_dir": folder,
             "preset": self.preset.name,
@@ -253,5 +252,10 @@ class Plan:
         )
 
     @property
+    def suffix(self) -> str:
+        """What follows the names of results on another variation set than the preset's."""
+        return "" if self.variation_set == self.preset.variation_set else f"_set{self.variation_set}"
+
+    @property
     def _prefix(self) -> str:
-        return "eval" if self.variation_set == REPORTED_VARIATION_SET else f"eval_set{self.variation_set}"
+        return f"eval{self.suffix}"

@@ -6,7 +6,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from lerobot_wm.constants import NUM_VARIATIONS
+from lerobot_wm.constants import NUM_SEEN_VARIATIONS, NUM_VARIATIONS, REPORTED_VARIATION_SET
 from lerobot_wm.envs.tasks import resolve_tasks
 from lerobot_wm.files import write_whole
 from lerobot_wm.report.arms import ARMS, TRAININGS, WM_IQL_IN_SWEEP, Arm
@@ -25,6 +25,8 @@ class Preset:
         name: As in records: the file's name.
         tasks: A task set or a comma-separated list.
         episodes_per_task: Demonstrations of each task.
+        variations: Variations of set 42 with demonstrations.
+        variation_set: The set of variations of the rollouts.
         noise: Standard deviation of the noise on the expert's actions.
         camera_name: The simulator's camera, or several separated by commas.
         first_eval_seed: Variation of each task's first rollout.
@@ -48,6 +50,8 @@ class Preset:
     arms: dict[str, list[int]]
     trainings: dict[str, dict[str, Any]]
     minutes: dict[str, float]
+    variations: str = f"0-{NUM_SEEN_VARIATIONS - 1}"
+    variation_set: int = REPORTED_VARIATION_SET
 
     @property
     def task_names(self) -> tuple[str, ...]:
@@ -55,7 +59,7 @@ class Preset:
         return resolve_tasks(self.tasks)
 
     @property
-    def variations(self) -> list[int]:
+    def rollout_variations(self) -> list[int]:
         """The variations of each task's rollouts."""
         seeds = range(self.first_eval_seed, self.first_eval_seed + self.rollouts_per_task)
         return [seed % NUM_VARIATIONS for seed in seeds]

@@ -42,7 +42,7 @@ class QuickPlan(Plan):
 
 
 def experiment(folder: Path, arms: list[tuple[str, int]]) -> Experiment:
-    plan = QuickPlan(replace(load_preset("smoke"), tasks="reach-v3"), folder / "outputs")
+    plan = QuickPlan(replace(load_preset("smoke"), tasks="reach-v3"), folder / "outputs", 42)
     runs = [(ARMS[name], seed) for name, seed in arms]
     return Experiment(plan, runs, folder / "results", processes=2, quality=False)
 

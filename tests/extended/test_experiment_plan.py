@@ -45,8 +45,8 @@ def _types() -> None:
     register_third_party_plugins()
 
 
-def plan(folder: Path, preset: str = "cpu", **fields: Any) -> Plan:
-    return Plan(load_preset(preset), folder, **fields)
+def plan(folder: Path, preset: str = "cpu", variation_set: int = 42) -> Plan:
+    return Plan(load_preset(preset), folder, variation_set)
 
 
 def finish(stage: Stage) -> None:
@@ -215,16 +215,27 @@ def test_selection_runs_are_kept_apart(tmp_path: Path) -> None:
     assert "--variation_set=42" in in_order(selection.evaluations(arm, 0))["dataset"].argv
 
 
+def test_data_and_rollouts_have_the_presets_variations(tmp_path: Path) -> None:
+    preset = replace(load_preset("cpu"), variations="0-49", variation_set=44)
+    [evaluation] = Plan(preset, tmp_path, preset.variation_set).evaluations(ARMS["wm_bc"], 0)
+    assert "--env.variation_set=44" in evaluation.argv
+    assert evaluation.folder == tmp_path / "seed_0" / "eval_wm_bc"
+    collection = in_order([evaluation])["dataset"].argv
+    assert {"--variation_set=42", "--variations=0-49"} <= set(collection)
+    [other] = Plan(preset, tmp_path, 43).evaluations(ARMS["wm_bc"], 0)
+    assert other.folder == tmp_path / "seed_0" / "eval_set43_wm_bc"
+
+
 def test_data_and_rollouts_have_the_presets_cameras(tmp_path: Path) -> None:
     two = replace(load_preset("cpu"), camera_name="corner2,topview")
-    [evaluation] = Plan(two, tmp_path).evaluations(ARMS["wm_bc"], 0)
+    [evaluation] = Plan(two, tmp_path, 42).evaluations(ARMS["wm_bc"], 0)
     assert "--env.camera_name=corner2,topview" in evaluation.argv
     assert "--camera_name=corner2,topview" in in_order([evaluation])["dataset"].argv
     assert load_preset("cpu").camera_name == "corner2"
 
 
 def test_all_rollouts_have_the_presets_length(tmp_path: Path) -> None:
-    short = Plan(replace(load_preset("cpu"), episode_length=70), tmp_path)
+    short = Plan(replace(load_preset("cpu"), episode_length=70), tmp_path, 42)
     for arm, flag in (("wm_bc", "--env.episode_length=70"), ("expert", "--episode_length=70")):
         [evaluation] = short.evaluations(ARMS[arm], 0)
         assert flag in evaluation.argv
