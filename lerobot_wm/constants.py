@@ -39,8 +39,14 @@ MT10: tuple[str, ...] = (
     "window-close-v3",
 )
 
-# Name of a task set on the command line -> its tasks. "mt50", all tasks, is resolved in envs/tasks.py.
-TASK_SETS: dict[str, tuple[str, ...]] = {"mt6": MT6, "mt10": MT10}
+# Meta-World's ML45: these five tasks are held out, and all others are for pretraining.
+ML45_TEST: tuple[str, ...] = (
+    "bin-picking-v3",
+    "box-close-v3",
+    "hand-insert-v3",
+    "door-lock-v3",
+    "door-unlock-v3",
+)
 
 ENV_TYPE = "metaworld_mt"
 NUM_VARIATIONS = 50

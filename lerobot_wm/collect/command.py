@@ -51,7 +51,7 @@ class CollectConfig:
     repo_id: str
     # Folder of the dataset; by default LeRobot's own place for repo_id.
     root: Path | None = None
-    # A task, a set (mt6, mt10, mt50) or a comma-separated list.
+    # A task, a set (mt6, mt10, mt50, ml45, ml45_test) or a comma-separated list.
     tasks: str = "mt6"
     # Successful episodes to collect of each task, spread evenly over the variations.
     episodes_per_task: int = 130

@@ -29,7 +29,7 @@ class ExpertConfig:
 
     # Folder of records.jsonl.
     output_dir: Path
-    # A task, a set (mt6, mt10, mt50) or a comma-separated list.
+    # A task, a set (mt6, mt10, mt50, ml45, ml45_test) or a comma-separated list.
     tasks: str = "mt6"
     # Set of variations: 42 for reported results, 43 for choosing settings and for probes, 44 for a final choice.
     variation_set: int = REPORTED_VARIATION_SET

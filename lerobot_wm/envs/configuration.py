@@ -35,7 +35,7 @@ class MetaworldMTEnvConfig(EnvConfig):
     """Meta-World tasks, each with 50 fixed variations; `reset(seed=k)` is variation k of the split.
 
     Args:
-        task: A task, a set (mt6, mt10, mt50) or a comma-separated list.
+        task: A task, a set (mt6, mt10, mt50, ml45, ml45_test) or a comma-separated list.
         split: "all" (variations 0-49), "seen" (0-9) or "unseen" (10-49).
         variation_set: 42 for reported results, 43 for choosing settings and for probes, or 44 for confirming a final
             choice.

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from importlib import resources
 from typing import TypedDict
 
-from lerobot_wm.constants import TASK_SETS
+from lerobot_wm.constants import ML45_TEST, MT6, MT10
 
 PUSH_BACK_DESCRIPTION = "Push the puck back to a goal"
 
@@ -32,11 +32,19 @@ def all_tasks() -> tuple[str, ...]:
     return tuple(sorted(ids, key=ids.__getitem__))
 
 
+@functools.cache
+def task_sets() -> dict[str, tuple[str, ...]]:
+    """The tasks of each set that has a name on the command line."""
+    ml45 = tuple(task for task in all_tasks() if task not in ML45_TEST)
+    return {"mt6": MT6, "mt10": MT10, "mt50": all_tasks(), "ml45": ml45, "ml45_test": ML45_TEST}
+
+
 def resolve_tasks(spec: str) -> tuple[str, ...]:
     """Turn a task argument into task names.
 
     Args:
-        spec: A task (`reach-v3`), a set (`mt6`, `mt10`, `mt50`) or a comma-separated list of either.
+        spec: A task (`reach-v3`), a set (`mt6`, `mt10`, `mt50`, `ml45`, `ml45_test`) or a comma-separated list of
+            either.
 
     Returns:
         Task names in the given order, each once.
@@ -44,17 +52,17 @@ def resolve_tasks(spec: str) -> tuple[str, ...]:
     Raises:
         ValueError: The argument is empty, or a name is unknown; suggests the closest names.
     """
-    task_sets = {**TASK_SETS, "mt50": all_tasks()}
+    sets = task_sets()
     names = [name.strip() for name in spec.split(",") if name.strip()]
     if not names:
-        raise ValueError(f"No task in '{spec}': give a task such as reach-v3, a list, or {_or(task_sets)}.")
+        raise ValueError(f"No task in '{spec}': give a task such as reach-v3, a list, or {_or(sets)}.")
     tasks: dict[str, None] = {}  # an ordered set
     for name in names:
-        if name not in task_sets and name not in all_tasks():
-            close = difflib.get_close_matches(name, [*all_tasks(), *task_sets], n=3, cutoff=0.5)
+        if name not in sets and name not in all_tasks():
+            close = difflib.get_close_matches(name, [*all_tasks(), *sets], n=3, cutoff=0.5)
             hint = f"did you mean {_or(close)}?" if close else f"tasks are {', '.join(all_tasks())}."
-            raise ValueError(f"Unknown Meta-World task '{name}' (task sets: {_or(task_sets)}); {hint}")
-        tasks.update(dict.fromkeys(task_sets.get(name, (name,))))
+            raise ValueError(f"Unknown Meta-World task '{name}' (task sets: {_or(sets)}); {hint}")
+        tasks.update(dict.fromkeys(sets.get(name, (name,))))
     return tuple(tasks)
 
 

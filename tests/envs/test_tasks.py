@@ -17,6 +17,7 @@ def test_task_sets() -> None:
     assert resolve_tasks("mt6") == MT6
     assert resolve_tasks("mt10") == MT10
     assert len(set(resolve_tasks("mt50"))) == 50
+    assert {*resolve_tasks("ml45"), *resolve_tasks("ml45_test")} == set(resolve_tasks("mt50"))
     assert resolve_tasks("reach-v3, mt6,reach-v3")[:2] == ("reach-v3", "button-press-topdown-v3")
     assert len(resolve_tasks("reach-v3,mt6")) == 6
 
@@ -28,6 +29,13 @@ def test_task_sets() -> None:
 def test_unknown_task_names_what_exists(spec: str, hint: str) -> None:
     with pytest.raises(ValueError, match=hint):
         resolve_tasks(spec)
+
+
+def test_held_out_tasks_are_metaworlds() -> None:
+    from metaworld.env_dict import ML45_V3
+
+    assert resolve_tasks("ml45_test") == tuple(ML45_V3["test"])
+    assert set(resolve_tasks("ml45")) == set(ML45_V3["train"])
 
 
 def test_names_equal_lerobots() -> None:

@@ -27,11 +27,10 @@ from lerobot_wm.constants import (
     OBS_IMAGES,
     OBS_LATENT,
     TASK,
-    TASK_SETS,
 )
 from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
 from lerobot_wm.envs.cameras import CAMERAS
-from lerobot_wm.envs.tasks import all_tasks, task_description
+from lerobot_wm.envs.tasks import all_tasks, task_description, task_sets
 from lerobot_wm.markdown import Markdown, render
 from lerobot_wm.policies.common.config import PolicyConfig
 
@@ -64,7 +63,7 @@ def _metaworld_tasks(descriptions: list[str]) -> str | None:
     if not descriptions or not set(descriptions) <= set(names):
         return None
     tasks = [names[description] for description in descriptions]
-    for name, members in TASK_SETS.items():
+    for name, members in task_sets().items():
         if set(members) == set(tasks):
             return name
     return ",".join(tasks)
