@@ -99,7 +99,8 @@ def diffusion(batch_size: int) -> list[Training]:
     """Diffusion Policy as LeRobot published it for PushT."""
     return [
         Training(
-            f"--policy.type=diffusion --batch_size={batch_size} {SCRATCH} --policy.horizon=16 --policy.n_action_steps=8 "
+            f"--policy.type=diffusion --batch_size={batch_size} {SCRATCH} "
+            "--policy.horizon=16 --policy.n_action_steps=8 "
             # 10 steps of DDIM: 100 of DDPM take minutes a decision for 25 rollouts on one core.
             "--policy.use_group_norm=true --policy.crop_ratio=0.875 "
             "--policy.noise_scheduler_type=DDIM --policy.num_inference_steps=10",
