@@ -38,16 +38,17 @@ def dataset(tmp_path: Path) -> LeRobotDataset:
     return record(tmp_path / "dataset", features, [("Reach", 6), ("Push", 12)])
 
 
-def test_the_world_model_of_the_page(
+def test_the_policy_and_the_world_model_of_the_page(
     tmp_path: Path,
     dataset: LeRobotDataset,
     monkeypatch: pytest.MonkeyPatch,
     lerobot_wm_command: Callable[..., None],
 ) -> None:
-    """Trained, it encodes; a policy on its latents has it in its checkpoint, and sees what it was trained on."""
+    """The world model encodes; policies on its latents have it in their checkpoint, and see what they learned from."""
     write_packages(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     flags = f"--discover_packages_path=wm_gru {TRAIN_FLAGS} --batch_size=4 --log_freq=1"
+    linear_flags = flags.replace("wm_gru", "wm_linear")
     images = f"--dataset.repo_id=test/recorded --dataset.root={dataset.root}"
     world_model = tmp_path / "gru" / "checkpoints" / "last" / "pretrained_model"
     lerobot_wm_command(
@@ -61,6 +62,10 @@ def test_the_world_model_of_the_page(
         f"train --policy.type=wm_bc --policy.world_model_path={world_model} {flags} --steps=2",
         f"--dataset.repo_id=test/latents --dataset.root={tmp_path / 'latents'} --output_dir={tmp_path / 'bc'}",
     )
+    lerobot_wm_command(
+        f"train --policy.type=wm_linear --policy.world_model_path={world_model} {linear_flags} --steps=2",
+        f"--dataset.repo_id=test/latents --dataset.root={tmp_path / 'latents'} --output_dir={tmp_path / 'linear'}",
+    )
     gru = get_policy_class("wm_gru").from_pretrained(world_model)
     gru.config.repo_id = "user/gru"
     card = str(gru.generate_model_card("user/data", "wm_gru", None, None))
@@ -68,20 +73,21 @@ def test_the_world_model_of_the_page(
     assert "select_action" not in card
     assert "--policy.world_model_path=user/gru" in card
     (world_model / "model.safetensors").unlink()
-    policy = get_policy_class("wm_bc").from_pretrained(
-        tmp_path / "bc" / "checkpoints" / "last" / "pretrained_model"
-    )
-    assert isinstance(policy, LatentPolicy)
-    assert policy.config.world_model.type == "wm_gru"
     encoded = LeRobotDataset("test/latents", root=tmp_path / "latents")
-    for index in range(6, 18):
-        item = dataset[index]
-        seen = {key: item[key][None] for key in (FRONT, WRIST, "observation.state")}
-        policy.select_action({**seen, "task": ["Push"]})
-        policy._prev_action = item["action"][None]
-        latent = policy._filter_state.latent[0]
-        torch.testing.assert_close(latent, encoded[index]["observation.latent"], atol=1e-5, rtol=1e-4)
-    assert latent.std() > 0.01
+    for policy_type, run in (("wm_bc", "bc"), ("wm_linear", "linear")):
+        policy = get_policy_class(policy_type).from_pretrained(
+            tmp_path / run / "checkpoints" / "last" / "pretrained_model"
+        )
+        assert isinstance(policy, LatentPolicy)
+        assert policy.config.world_model.type == "wm_gru"
+        for index in range(6, 18):
+            item = dataset[index]
+            seen = {key: item[key][None] for key in (FRONT, WRIST, "observation.state")}
+            assert policy.select_action({**seen, "task": ["Push"]}).shape == (1, 3)
+            policy._prev_action = item["action"][None]
+            latent = policy._filter_state.latent[0]
+            torch.testing.assert_close(latent, encoded[index]["observation.latent"], atol=1e-5, rtol=1e-4)
+        assert latent.std() > 0.01
 
 
 def test_a_package_that_is_not_there(lerobot_wm_command: Callable[..., None]) -> None:
