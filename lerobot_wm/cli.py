@@ -21,7 +21,6 @@ from lerobot_wm.system import hide_harmless_messages
 COMMANDS: dict[str, tuple[str, str]] = {
     "collect": ("lerobot_wm.collect.command", "scripted-expert Meta-World demonstrations -> LeRobotDataset"),
     "expert": ("lerobot_wm.commands.expert", "rollouts of the scripted expert -> records"),
-    "relabel": ("lerobot_wm.commands.relabel", "copy of a dataset with another column as its reward"),
     "repair": ("lerobot_wm.commands.repair", "copy of a LeRobot 2 or wrongly timed dataset, repaired"),
     "rename": ("lerobot_wm.commands.rename", "copy of a dataset with other names for its features"),
     "init": ("lerobot_wm.commands.init", "checkpoint of an untrained world model or a frozen image backbone"),

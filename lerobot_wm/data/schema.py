@@ -23,9 +23,8 @@ from lerobot_wm.constants import (
     VARIATION,
 )
 
-# How `lerobot-wm collect` made the dataset, and which column `lerobot-wm relabel` made its reward.
+# How `lerobot-wm collect` made the dataset.
 COLLECTION_RECORD = Path("meta", "collection.json")
-RELABEL_RECORD = Path("meta", "relabel.json")
 STATE_NAMES = ["x", "y", "z", "gripper"]
 
 

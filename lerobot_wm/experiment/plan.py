@@ -14,7 +14,6 @@ from lerobot.utils.constants import (
 )
 
 from lerobot_wm.constants import (
-    DENSE_REWARD,
     ENV_TYPE,
     NUM_VARIATIONS,
     QUALITY_NAME,
@@ -23,7 +22,7 @@ from lerobot_wm.constants import (
     SELECTION_VARIATION_SET,
 )
 from lerobot_wm.data.latents import RECORD_PATH
-from lerobot_wm.data.schema import COLLECTION_RECORD, RELABEL_RECORD
+from lerobot_wm.data.schema import COLLECTION_RECORD
 from lerobot_wm.experiment.preset import Preset, config_file
 from lerobot_wm.experiment.stage import Checkpoint, Dataset, Stage, lerobot_wm
 from lerobot_wm.report.arms import WM_RSSM, Arm, Encoder
@@ -49,26 +48,6 @@ class Plan:
         """Scripted demonstrations, with the 0/1 reward."""
         count = self.preset.episodes_per_task
         return self._collect("dataset", count, self.preset.variations, REPORTED_VARIATION_SET)
-
-    def dense_demonstrations(self) -> Dataset:
-        """The same ones with Meta-World's shaped reward."""
-        source, folder = self.demonstrations(), self.output_dir / "dataset_dense"
-        repo_id = f"local/{self.preset.name}_{folder.name}"
-        flags = {
-            **source.flags(),
-            "reward": DENSE_REWARD,
-            "output_repo_id": repo_id,
-            "output_root": folder,
-        }
-        stage = Stage(
-            name=folder.name,
-            kind="relabel",
-            argv=lerobot_wm("relabel", flags),
-            folder=folder,
-            artefact=folder / RELABEL_RECORD,
-            needs=(source.made_by,),
-        )
-        return Dataset(stage, repo_id)
 
     def held_out_demonstrations(self) -> Dataset:
         """Demonstrations of variations that nothing is trained on, at most one episode each."""
@@ -173,7 +152,7 @@ class Plan:
             dataset = self._latents(arm.encoder, seed)
             flags.append(f"--policy.world_model_path={self._encoder(arm.encoder, seed).path}")
         else:
-            dataset = self.dense_demonstrations() if arm.dense_reward else self.demonstrations()
+            dataset = self.demonstrations()
         if task is not None:
             # A collection's episodes are in the order of its tasks, the same number for each.
             count, position = self.preset.episodes_per_task, self.preset.task_names.index(task)

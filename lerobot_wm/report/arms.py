@@ -6,6 +6,8 @@ Each arm is stated once, here: `report` takes its order and description, `experi
 from dataclasses import dataclass, replace
 from typing import Any
 
+from lerobot_wm.constants import DENSE_REWARD
+
 # What sets the policies apart, by the name of their training settings. Presets add sizes and rates (configs/).
 TRAININGS: dict[str, dict[str, Any]] = {
     "wm_rssm": {"type": "wm_rssm"},
@@ -56,7 +58,6 @@ class Arm:
         training: Key of `TRAININGS`; None for the scripted expert.
         encoder: Source of the latents that the policy reads; None for a policy on the demonstrations themselves.
         individual: One policy per task instead of one for all tasks.
-        dense_reward: Learn from Meta-World's shaped reward instead of the sparse 0/1 reward.
         trained_as: Name of the training run whose checkpoint is rolled out; None for the arm's own name.
         train_flags: Further flags of `lerobot-wm train`.
         eval_flags: Further flags of `lerobot-wm eval`.
@@ -67,7 +68,6 @@ class Arm:
     training: str | None
     encoder: Encoder | None = None
     individual: bool = False
-    dense_reward: bool = False
     trained_as: str | None = None
     train_flags: tuple[str, ...] = ()
     eval_flags: tuple[str, ...] = ()
@@ -81,8 +81,8 @@ class Arm:
 # Inverse temperatures of the sweep. Their actors are trained beside that of wm_iql (beta 0.5), on the same critics.
 SWEEP_BETAS = (0, 3, 10)
 _SWEEP_FLAG = f"--policy.iql.sweep_betas=[{','.join(map(str, SWEEP_BETAS))}]"
-# If success ended the return, a dense reward would teach the policy to put success off.
-_NO_END = ("--policy.iql.done_key=never",)
+# Meta-World's shaped reward. If success ended the return, it would teach the policy to put success off.
+_DENSE_REWARD = (f"--policy.reward_key={DENSE_REWARD}", "--policy.iql.done_key=never")
 
 _WM_IQL = Arm(
     "wm_iql", "IQL on latents of the world model, one policy for all tasks, β 0.5", "wm_iql", WM_RSSM
@@ -126,16 +126,14 @@ ARMS: dict[str, Arm] = {
             "e2e_iql_dense",
             "e2e_iql trained on the dense reward, as in the paper",
             "e2e_iql",
-            dense_reward=True,
-            train_flags=_NO_END,
+            train_flags=_DENSE_REWARD,
         ),
         Arm(
             "e2e_iql_single_dense",
             "e2e_iql_single trained on the dense reward, as in the paper",
             "e2e_iql_single",
             individual=True,
-            dense_reward=True,
-            train_flags=_NO_END,
+            train_flags=_DENSE_REWARD,
         ),
         Arm(
             "wm_iql_single",

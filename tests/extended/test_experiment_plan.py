@@ -14,7 +14,6 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_wm.collect.command import CollectConfig
 from lerobot_wm.commands.expert import ExpertConfig
 from lerobot_wm.commands.init import InitConfig
-from lerobot_wm.commands.relabel import RelabelConfig
 from lerobot_wm.constants import MT6
 from lerobot_wm.encode.command import EncodeConfig
 from lerobot_wm.evaluate.rollouts import EvaluateConfig
@@ -34,7 +33,6 @@ CONFIGS: dict[str, Any] = {
     "expert": ExpertConfig,
     "init": InitConfig,
     "quality": QualityConfig,
-    "relabel": RelabelConfig,
     "report": ReportConfig,
     "train": TrainPipelineConfig,
 }
@@ -119,7 +117,9 @@ def test_data_of_each_arm(tmp_path: Path) -> None:
         return str(Path(flag.partition("=")[2]).relative_to(tmp_path))
 
     assert root("wm_rssm") == root("e2e_iql") == root("proprio_bc") == root("state_bc") == "dataset"
-    assert root("e2e_iql_dense") == root(f"e2e_iql_single_dense_{MT6[0]}") == "dataset_dense"
+    for run in ("e2e_iql_dense", f"e2e_iql_single_dense_{MT6[0]}"):
+        assert root(run) == "dataset"
+        assert "--policy.reward_key=next.dense_reward" in stages[f"seed_0/{run}"].argv
     assert root("wm_bc") == root("wm_iql_sweep") == root(f"wm_bc_single_{MT6[0]}") == "seed_0/latents_wm_rssm"
     assert root("frozen_bc") == "seed_0/latents_frozen_backbone"
     door = ",".join(map(str, range(130, 260)))

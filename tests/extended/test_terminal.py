@@ -29,8 +29,8 @@ COMMANDS = {
         "--world_model_path={world_model} --device=cpu {dataset} --output_repo_id=test/l --output_root=out",
         "Encoding: 100%",
     ),
-    "relabel": (
-        "--reward=next.dense_reward {dataset} --output_repo_id=test/d --output_root=out",
+    "rename": (
+        '--rename_map={{"next.dense_reward":"next.shaped"}} {dataset} --output_repo_id=test/d --output_root=out',
         "Copying: 100%",
     ),
 }

@@ -94,7 +94,7 @@ def test_commands_end_in_one_line_and_ask_no_network(
         output = ["--output_repo_id=a/b", f"--output_root={tmp_path / 'out'}"]
         commands = [
             ["train", *flags, *training, f"--output_dir={tmp_path / 'run'}"],
-            ["relabel", *flags, "--reward=next.reward", *output],
+            ["rename", *flags, '--rename_map={"next.reward":"next.success_reward"}', *output],
         ]
         lines += commands if all_faults else [commands[number % 2]]
     environment = {name: value for name, value in os.environ.items() if name != "HF_HUB_OFFLINE"}

@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import save_file
 
 from lerobot_wm.collect.command import CollectConfig
-from lerobot_wm.commands.relabel import relabel
+from lerobot_wm.commands.rename import rename
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.loader import RamDataset
 from lerobot_wm.data.source import open_dataset
@@ -48,7 +48,7 @@ def test_tasks_of_any_name_are_text(tmp_path: Path) -> None:
     dataset = LeRobotDataset("test/faults", root=root)
     batch = RamDataset(dataset, torch.device("cpu")).batch(list(range(0, 24, 3)))
     assert batch["task"] == list(HOSTILE)
-    copy = relabel(dataset, "next.reward", "test/copy", tmp_path / "in" / "copy")
+    copy = rename(dataset, {"next.reward": "next.shaped"}, "test/copy", tmp_path / "in" / "copy")
     assert list(copy.meta.tasks.index) == list(HOSTILE)
     created = names_below(tmp_path) - before
     assert {name.split("/")[1] for name in created} == {"copy", "dataset.cache"}
