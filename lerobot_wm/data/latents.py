@@ -64,18 +64,14 @@ class LatentRecord:
         source_repo_id: The image dataset.
         source_fingerprint: `dataset_fingerprint` of the image dataset.
         tasks: Task strings in order of task_index.
-        sampled: Whether z_t is a sample of the posterior rather than its mean.
         camera_shapes: (C, H, W) in the image dataset of each camera that was encoded.
-        sample_seed: Seed of the samples; None if there are none.
     """
 
     world_model_fingerprint: str
     source_repo_id: str
     source_fingerprint: str
     tasks: list[str]
-    sampled: bool
     camera_shapes: dict[str, list[int]] = field(default_factory=dict)
-    sample_seed: int | None = None
 
     @property
     def made_of(self) -> dict[str, str]:
@@ -83,8 +79,6 @@ class LatentRecord:
         return {
             "world_model_fingerprint": self.world_model_fingerprint,
             "source_fingerprint": self.source_fingerprint,
-            "sampled": str(self.sampled),
-            "sample_seed": str(self.sample_seed),
             "cameras": ", ".join(self.camera_shapes),
         }
 
@@ -107,8 +101,12 @@ class LatentRecord:
                 "encode`."
             )
         try:
-            return cls(**json.loads(path.read_text(encoding="utf-8")))
-        except (ValueError, TypeError) as error:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            # Release 0.2.0 could store samples of z_t.
+            return cls(
+                **{key: value for key, value in record.items() if key not in ("sampled", "sample_seed")}
+            )
+        except (ValueError, TypeError, AttributeError) as error:
             raise ValueError(
                 f"{path} is not a record of latents ({error}): it is incomplete or damaged; copy the dataset again, or "
                 "encode it again with `lerobot-wm encode`."

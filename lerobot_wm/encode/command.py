@@ -31,8 +31,6 @@ class EncodeConfig:
         dataset: The image dataset.
         output_repo_id: Repository id of the latent dataset.
         output_root: Folder of the latent dataset; must not exist yet.
-        sample: Store a sample of z_t instead of its mean.
-        seed: Seed of the samples.
         rename_map: The world model's names for cameras and proprioception of the dataset, where they differ, as in
             `lerobot-train`. Features in the latent dataset keep the dataset's own names.
         device: Device of the world model; None selects the fastest one.
@@ -49,8 +47,6 @@ class EncodeConfig:
     dataset: SourceConfig
     output_repo_id: str
     output_root: Path
-    sample: bool = False
-    seed: int = 0
     rename_map: dict[str, str] = field(default_factory=dict)
     device: str | None = None
     shard: str | None = None
@@ -73,15 +69,14 @@ def _run(cfg: EncodeConfig, job: Job | None) -> None:
     policy = load_encoder(cfg.world_model_path)
     policy.to(cfg.device or auto_select_torch_device())
     source = cfg.dataset.open()
-    sample_seed = cfg.seed if cfg.sample else None
     if job is not None:
-        encode_job(policy, source, cfg.output_root, job, rename_map=cfg.rename_map, sample_seed=sample_seed)
+        encode_job(policy, source, cfg.output_root, job, rename_map=cfg.rename_map)
         return
     if cfg.push_to_hub and cfg.output_root.exists():
         # An earlier push did not finish.
         check_same_settings(
             LatentRecord.read(cfg.output_root).made_of,
-            latent_record(policy, source, cfg.rename_map, sample_seed).made_of,
+            latent_record(policy, source, cfg.rename_map).made_of,
             f"{cfg.output_root} has latents",
             "choose another --output_root, or remove it",
         )
@@ -93,7 +88,6 @@ def _run(cfg: EncodeConfig, job: Job | None) -> None:
             cfg.output_repo_id,
             cfg.output_root,
             rename_map=cfg.rename_map,
-            sample_seed=sample_seed,
         )
     print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames -> {cfg.output_root}")
     if cfg.push_to_hub:

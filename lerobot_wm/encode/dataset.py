@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow.parquet as pq
 import torch
 from lerobot.datasets.compute_stats import get_feature_stats
@@ -64,7 +63,6 @@ def filter_batches(
     batches: Sequence[range],
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
-    sample_seed: int | None = None,
 ) -> Iterator[Tensor]:
     """Encode some batches of a dataset's episodes; images of other episodes are not decoded.
 
@@ -73,7 +71,6 @@ def filter_batches(
         source: The image dataset.
         batches: Some of its `episode_batches`, in their order.
         rename_map: Names that the world model has for features of the dataset.
-        sample_seed: Seed to sample z_t with; None takes its mean.
 
     Yields:
         The latents s_t of each batch, (N, L) float32 on the CPU.
@@ -91,12 +88,7 @@ def filter_batches(
         of_batch = episodes[start : start + len(batch)]
         start += len(batch)
         embeds, actions = embed_episodes(world_model, of_batch)
-        if sample_seed is not None:
-            # A seed for each batch: its samples do not depend on which job encodes it, or after what.
-            [seed] = np.random.SeedSequence([sample_seed, batch.start]).generate_state(1)
-            torch.manual_seed(int(seed))
-        states = world_model.filter_embeds(embeds, actions, sample=sample_seed is not None)
-        latents = states.latent.cpu()  # (B, T, L)
+        latents = world_model.filter_embeds(embeds, actions).latent.cpu()  # (B, T, L)
         yield torch.cat([latents[i, : len(episode)] for i, episode in enumerate(of_batch)])
 
 
@@ -129,7 +121,6 @@ class LatentBatches:
         source: LeRobotDataset,
         batches: Sequence[range],
         rename_map: Mapping[str, str],
-        sample_seed: int | None,
     ) -> None:
         """Encode the batches that are not in the folder yet, see `filter_batches`.
 
@@ -144,7 +135,7 @@ class LatentBatches:
             return
         first_frames = source.meta.episodes["dataset_from_index"]
         with tqdm(total=sum(map(len, missing)), desc="Encoding", unit="episode") as bar:
-            encoded = filter_batches(policy, source, missing, rename_map=rename_map, sample_seed=sample_seed)
+            encoded = filter_batches(policy, source, missing, rename_map=rename_map)
             for batch, latents in zip(missing, encoded, strict=True):
                 is_finite = latents.isfinite().all(dim=1)  # (N,)
                 if not is_finite.all():
@@ -183,7 +174,6 @@ def encode(
     output_root: Path,
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
-    sample_seed: int | None = None,
 ) -> LeRobotDataset:
     """Write a copy of a dataset with `observation.latent` (L,) instead of its cameras.
 
@@ -196,7 +186,6 @@ def encode(
         output_repo_id: Repository id of the result.
         output_root: Folder of the result.
         rename_map: Names that the world model has for features of the dataset.
-        sample_seed: Seed to sample z_t with; None stores its mean.
 
     Returns:
         The latent dataset.
@@ -206,9 +195,9 @@ def encode(
         ValueError: The dataset lacks a camera of the world model or proprioception, or has actions of another size
             than it was trained with, or latents are not finite.
     """
-    record, latent_batches = _begin(policy, source, output_root, rename_map, sample_seed)
+    record, latent_batches = _begin(policy, source, output_root, rename_map)
     batches = episode_batches(source)
-    latent_batches.encode_missing(policy, source, batches, rename_map, sample_seed)
+    latent_batches.encode_missing(policy, source, batches, rename_map)
     latents = latent_batches.read(batches).numpy()  # (N, L), in the dataset's order
     with appears_whole(output_root) as temporary:
         with quiet():
@@ -244,15 +233,14 @@ def encode_job(
     job: Job,
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
-    sample_seed: int | None = None,
 ) -> None:
     """Encode one job's part of a dataset into `<output_root>.parts`; `encode` makes a dataset of all parts.
 
     Raises what `encode` does.
     """
-    _, latent_batches = _begin(policy, source, output_root, rename_map, sample_seed)
+    _, latent_batches = _begin(policy, source, output_root, rename_map)
     batches = episode_batches(source)
-    latent_batches.encode_missing(policy, source, job.select(batches), rename_map, sample_seed)
+    latent_batches.encode_missing(policy, source, job.select(batches), rename_map)
     done = len(batches) - len(latent_batches.missing(batches))
     print(
         f"Job {job.index}/{job.count} is done: {done} of {len(batches)} batches are in {latent_batches.folder}. "
@@ -265,11 +253,10 @@ def _begin(
     source: LeRobotDataset,
     output_root: Path,
     rename_map: Mapping[str, str],
-    sample_seed: int | None,
 ) -> tuple[LatentRecord, LatentBatches]:
     """Check that the dataset can be encoded; returns the record of the result and the place of its latents."""
     folder = parts_folder(output_root)
-    record = latent_record(policy, source, rename_map, sample_seed)
+    record = latent_record(policy, source, rename_map)
     if output_root.exists():
         # A run that was killed at its very end may have left the parts of this very dataset.
         with suppress(ValueError):
@@ -283,7 +270,7 @@ def _begin(
 
 
 def latent_record(
-    policy: EncoderPolicy, source: LeRobotDataset, rename_map: Mapping[str, str], sample_seed: int | None
+    policy: EncoderPolicy, source: LeRobotDataset, rename_map: Mapping[str, str]
 ) -> LatentRecord:
     """The record of the latents that `encode` would make."""
     features = renamed(policy_features(source.meta), rename_map)
@@ -292,9 +279,7 @@ def latent_record(
         source_repo_id=source.repo_id,
         source_fingerprint=dataset_fingerprint(Path(source.root)),
         tasks=[str(task) for task in source.meta.tasks.index],
-        sampled=sample_seed is not None,
         camera_shapes={key: list(features[key].shape) for key in policy.config.cameras if key in features},
-        sample_seed=sample_seed,
     )
 
 

@@ -47,11 +47,10 @@ class LatentModel(nn.Module, ABC):
         """Compute the embeddings e_t, each from its own frame alone: (B, T, E)."""
 
     @abstractmethod
-    def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> LatentState:
+    def filter_embeds(self, embeds: Tensor, actions: Tensor) -> LatentState:
         """Compute the states (B, T, ·) of whole episodes from embeddings and the action a_t executed at each frame.
 
-        s_t may depend on a_{t-1} and earlier actions, never on a_t. With `sample`, a stochastic state is drawn from its
-        distribution; otherwise it is the mean.
+        s_t may depend on a_{t-1} and earlier actions, never on a_t. A stochastic state is its distribution's mean.
         """
 
     @abstractmethod

@@ -104,12 +104,9 @@ class WorldModel(LatentModel):
         """
         return self.filter_embeds(self.embed(images, proprio), actions)
 
-    def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> RSSMState:
-        """Filter whole episodes from their embeddings (B, T, E) and actions a_t (B, T, A).
-
-        z_t is the posterior mean, or drawn from the posterior with `sample`.
-        """
-        return self._observe(embeds, self._previous_actions(actions), sample=sample)[0]
+    def filter_embeds(self, embeds: Tensor, actions: Tensor) -> RSSMState:
+        """Filter whole episodes from embeddings (B, T, E) and actions a_t (B, T, A); z_t is the posterior mean."""
+        return self._observe(embeds, self._previous_actions(actions))[0]
 
     def filter_with_kl(self, embeds: Tensor, actions: Tensor) -> tuple[RSSMState, Tensor]:
         """Filter as `filter_embeds` does; also return KL(posterior || prior) in nats, (B, T)."""

@@ -149,7 +149,7 @@ class FrozenBackbone(LatentModel):
         """The features of images (B, T, 3·K, H, W) in [0, 1], (B, T, F); see `LatentModel.observe`."""
         return PlainState(self.embed(images))
 
-    def filter_embeds(self, embeds: Tensor, actions: Tensor, *, sample: bool = False) -> PlainState:
+    def filter_embeds(self, embeds: Tensor, actions: Tensor) -> PlainState:
         """The features themselves, (B, T, F); see `LatentModel.filter_embeds`."""
         return PlainState(embeds)
 
