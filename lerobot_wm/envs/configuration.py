@@ -25,18 +25,17 @@ from lerobot_wm.constants import (
 )
 from lerobot_wm.envs.cameras import image_features, parse_cameras
 from lerobot_wm.envs.tasks import resolve_tasks
-from lerobot_wm.envs.variations import split_variations
+from lerobot_wm.envs.variations import check_variation_set
 from lerobot_wm.system import usable_cores
 
 
 @EnvConfig.register_subclass(ENV_TYPE)
 @dataclass
 class MetaworldMTEnvConfig(EnvConfig):
-    """Meta-World tasks, each with 50 fixed variations; `reset(seed=k)` is variation k of the split.
+    """Meta-World tasks, each with 50 fixed variations; `reset(seed=k)` is variation k.
 
     Args:
         task: A task, a set (mt6, mt10, mt50, ml45, ml45_test) or a comma-separated list.
-        split: "all" (variations 0-49), "seen" (0-9) or "unseen" (10-49).
         variation_set: 42 for reported results, 43 for choosing settings and for probes, or 44 for confirming a final
             choice.
         environment_state: Add the full state, `observation.environment_state` (39,), to the observation.
@@ -50,7 +49,6 @@ class MetaworldMTEnvConfig(EnvConfig):
 
     task: str = "mt6"
     fps: int = FPS
-    split: str = "all"
     variation_set: int = REPORTED_VARIATION_SET
     environment_state: bool = False
     image_size: int = IMAGE_SIZE
@@ -69,7 +67,7 @@ class MetaworldMTEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         """Check the fields and add the features of the cameras."""
         resolve_tasks(self.task)
-        split_variations(self.split, self.variation_set)
+        check_variation_set(self.variation_set)
         if self.obs_type != "pixels_agent_pos":
             raise ValueError(f"obs_type is '{self.obs_type}'; expected 'pixels_agent_pos'.")
         if self.image_size < 16:
@@ -95,7 +93,6 @@ class MetaworldMTEnvConfig(EnvConfig):
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of `MetaworldMTEnv` except its task."""
         return {
-            "split": self.split,
             "variation_set": self.variation_set,
             "environment_state": self.environment_state,
             "image_size": self.image_size,

@@ -12,13 +12,13 @@ from lerobot_wm.constants import (
     FPS,
     IMAGE_SIZE,
     MAX_EPISODE_STEPS,
+    NUM_VARIATIONS,
     REPORTED_VARIATION_SET,
     STATE_DIM,
 )
 from lerobot_wm.envs.cameras import parse_cameras
 from lerobot_wm.envs.rendering import Renderer, RenderKey
 from lerobot_wm.envs.tasks import task_description
-from lerobot_wm.envs.variations import split_variations
 
 if TYPE_CHECKING:
     from lerobot_wm.envs.simulation import Simulation
@@ -40,7 +40,6 @@ class MetaworldMTEnv(gym.Env):
 
     Args:
         task: A Meta-World v3 task, such as "reach-v3".
-        split: "all", "seen" (variations 0-9) or "unseen" (10-49).
         variation_set: 42 for reported results, 43 for choosing settings and for probes, or 44 for confirming a final
             choice.
         environment_state: Add the full state to the observation.
@@ -58,7 +57,6 @@ class MetaworldMTEnv(gym.Env):
     def __init__(
         self,
         task: str,
-        split: str = "all",
         variation_set: int = REPORTED_VARIATION_SET,
         environment_state: bool = False,
         image_size: int = IMAGE_SIZE,
@@ -70,7 +68,6 @@ class MetaworldMTEnv(gym.Env):
         self.task_description = task_description(task)
         # LeRobot's rollout reads this name.
         self._max_episode_steps = episode_length
-        self._variations = split_variations(split, variation_set)
         self._variation_set = variation_set
         self._environment_state = environment_state
         self._render_keys = {
@@ -107,14 +104,14 @@ class MetaworldMTEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start variation `seed` of the split, modulo their number; without a seed, the next one."""
+        """Start variation `seed`, modulo their number; without a seed, the next one."""
         super().reset(seed=seed)
         if self._sim is None:
             self._build()
         assert self._sim is not None
         index = self._next_index if seed is None else seed
         self._next_index = index + 1
-        self.variation = self._variations[index % len(self._variations)]
+        self.variation = index % NUM_VARIATIONS
         self._steps = 0
         self._state = self._sim.reset(self.variation)
         return self._observe(), {"is_success": False, "variation": self.variation}

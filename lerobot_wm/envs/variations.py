@@ -23,13 +23,6 @@ from lerobot_wm.constants import NUM_SEEN_VARIATIONS, NUM_VARIATIONS, REPORTED_V
 VARIATIONS_PATH = Path(__file__).with_name("variations.json")
 VARIATIONS_SHA256 = "bc2e8bd895455ce2120df8096758c87a0b297d0ac6d9f89a678c031460d45b00"
 
-# Variations of each split; demonstrations of set 42 are collected on 0-9 and training never sees 10-49.
-SPLITS: dict[str, range] = {
-    "all": range(NUM_VARIATIONS),
-    "seen": range(NUM_SEEN_VARIATIONS),
-    "unseen": range(NUM_SEEN_VARIATIONS, NUM_VARIATIONS),
-}
-
 
 @functools.cache
 def _load() -> dict[str, dict[str, list[list[float]]]]:
@@ -58,23 +51,6 @@ def check_variation_set(variation_set: int) -> None:
         raise ValueError(
             f"variation_set is {variation_set}; expected one of {', '.join(map(str, VARIATION_SETS))}."
         )
-
-
-def split_variations(split: str, variation_set: int = REPORTED_VARIATION_SET) -> range:
-    """The variations of a split.
-
-    Raises:
-        ValueError: The split is unknown, or it is seen or unseen in a set without demonstrations.
-    """
-    check_variation_set(variation_set)
-    if split not in SPLITS:
-        raise ValueError(f"Unknown split '{split}'; expected one of {', '.join(SPLITS)}.")
-    if split != "all" and variation_set != REPORTED_VARIATION_SET:
-        raise ValueError(
-            f"split is '{split}', but set {variation_set} has no seen variations: use split 'all', or variation set "
-            f"{REPORTED_VARIATION_SET}."
-        )
-    return SPLITS[split]
 
 
 def is_seen(variation: int, variation_set: int = REPORTED_VARIATION_SET) -> bool:

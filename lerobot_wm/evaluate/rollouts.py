@@ -19,9 +19,9 @@ from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.io_utils import write_video
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_wm.constants import RECORDS_NAME
+from lerobot_wm.constants import NUM_VARIATIONS, RECORDS_NAME
 from lerobot_wm.envs.configuration import MetaworldMTEnvConfig
-from lerobot_wm.envs.variations import is_seen, split_variations
+from lerobot_wm.envs.variations import is_seen
 from lerobot_wm.evaluate.wandb_log import training_config
 from lerobot_wm.policies.common.checks import check_fit
 from lerobot_wm.policies.latent.config import LatentPolicyConfig
@@ -101,8 +101,7 @@ def variation_of(env: EnvConfig, seed: int) -> tuple[int, bool | None]:
     """(variation, seen) of `reset(seed=seed)`, for records; (seed, None) for other environments than metaworld_mt."""
     if not isinstance(env, MetaworldMTEnvConfig):
         return seed, None
-    variations = split_variations(env.split, env.variation_set)
-    variation = variations[seed % len(variations)]
+    variation = seed % NUM_VARIATIONS
     return variation, is_seen(variation, env.variation_set)
 
 

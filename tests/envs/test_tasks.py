@@ -81,8 +81,6 @@ def test_reported_variations_never_change() -> None:
 def test_seen_are_the_variations_collected_on() -> None:
     assert [variations.is_seen(k) for k in (0, 9, 10, 49)] == [True, True, False, False]
     assert not any(variations.is_seen(k, 43) for k in range(50))
-    with pytest.raises(ValueError, match="43 has no seen variations"):
-        variations.split_variations("seen", 43)
 
 
 def test_changed_variations_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +97,6 @@ def test_changed_variations_are_refused(tmp_path: Path, monkeypatch: pytest.Monk
     ("field", "value", "message"),
     [
         ("task", "reach", "reach-v3"),
-        ("split", "train", "all, seen, unseen"),
         ("variation_set", 45, "one of 42, 43, 44"),
         ("camera_name", "corner4", "did you mean corner"),
         ("camera_name", "corner2,", "unknown camera ''"),

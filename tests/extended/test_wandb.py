@@ -86,7 +86,7 @@ def test_an_evaluation_logs_its_tables(
     # This policy was trained without wandb: the evaluation is a run of its own.
     lerobot_wm_command(
         f"eval --policy.path={policy_paths['wm_bc']} --policy.device=cpu --env.type=metaworld_mt",
-        "--env.task=reach-v3 --env.episode_length=3 --env.split=unseen --eval.n_episodes=2 --seed=0",
+        "--env.task=reach-v3 --env.episode_length=3 --eval.n_episodes=2 --seed=10",
         f"--output_dir={tmp_path} --videos_per_task=0 --wandb.enable=true --wandb.mode=offline",
     )
     records = [json.loads(line) for line in (tmp_path / "records.jsonl").read_text().splitlines()]
