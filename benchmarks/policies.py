@@ -309,8 +309,9 @@ def measure(task: Task, policy: str, arguments: argparse.Namespace, folder: Path
 
 
 def difference(ours: list[bool], other: list[bool]) -> str:
-    """Success of ours minus another's in points, with its 95% interval over the starts."""
-    each = 100 * (np.array(ours, dtype=float) - np.array(other, dtype=float))  # (episodes,)
+    """Success of ours minus another's in points, with its 95% interval over the starts that both have."""
+    n = min(len(ours), len(other))
+    each = 100 * (np.array(ours[:n], dtype=float) - np.array(other[:n], dtype=float))  # (n,)
     low, high = percentile_interval(resample(each, np.random.default_rng(RNG_SEED)).mean(axis=1))
     return f"{each.mean():+.0f} [{low:+.0f}, {high:+.0f}]"
 
