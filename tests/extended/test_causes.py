@@ -6,6 +6,7 @@ import pwd
 import shlex
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -237,7 +238,8 @@ def test_two_tasks_of_one_sentence_are_not_learned_as_one(tmp_path: Path) -> Non
     with only_episodes([0, 1]):
         assert tasks_to_learn(dataset.meta) == ["Push", "Reach"]
     command = str(error.value).partition("`")[2].partition("`")[0].replace("ANOTHER SENTENCE", "Push back")
-    subprocess.run(shlex.split(command), check=True)
+    program, *flags = shlex.split(command)
+    subprocess.run([Path(sys.executable).parent / program, *flags], check=True)
     dataset = LeRobotDataset(dataset.repo_id, root=dataset.root)
     assert sorted(tasks_to_learn(dataset.meta)) == ["Push", "Push back", "Reach"]
 
