@@ -5,7 +5,7 @@ import json
 import platform
 import shlex
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from glob import glob
@@ -254,7 +254,7 @@ def run_statistics(records: list[Record]) -> RunStatistics:
     )
 
 
-def mean_over_groups(records: list[Record], groups: Iterable[Iterable[str]]) -> Estimate:
+def mean_over_groups(records: list[Record], groups: Collection[Collection[str]]) -> Estimate:
     """Mean over groups of tasks of each group's mean success, with the interval of `run_statistics`.
 
     Args:
