@@ -139,7 +139,7 @@ TASKS = {
     ),
     "mt10": Task(
         "--env.type=metaworld_mt --env.task=mt10 --env.camera_name=hand_top,hand_side,gripperPOV "
-        "--env.episode_length=500 --eval.batch_size=5",
+        "--env.episode_length=500 --eval.batch_size=1",
         {
             "wm_bc": ours(
                 0.85,
@@ -303,9 +303,22 @@ def measure(task: Task, policy: str, arguments: argparse.Namespace, folder: Path
         "minutes": sum(each["seconds"] for each in runs) / 60,
         "memory_gb": max(each["memory_gb"] for each in runs),
         "latency_ms": latency(previous, arguments.root),
-        "successes": [bool(each) for info in infos for each in info["metrics"]["successes"]],
-        "max_rewards": [float(each) for info in infos for each in info["metrics"]["max_rewards"]],
+        "successes": [bool(each) for each in by_start(infos, "successes")],
+        "max_rewards": [float(each) for each in by_start(infos, "max_rewards")],
     }
+
+
+def by_start(infos: list[dict[str, Any]], metric: str) -> list[Any]:
+    """A metric of every episode: each task's first start, then each task's second, and so on.
+
+    So the starts of a run with fewer episodes are the first ones of a run with more.
+
+    Args:
+        infos: Of each task, what lerobot-eval measured.
+        metric: Its name.
+    """
+    starts = zip(*(info["metrics"][metric] for info in infos), strict=True)
+    return [value for of_start in starts for value in of_start]
 
 
 def difference(ours: list[bool], other: list[bool]) -> str:

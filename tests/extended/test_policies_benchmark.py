@@ -26,6 +26,13 @@ def test_success_is_compared_start_by_start() -> None:
     assert policies.difference(lost, won).startswith("-60 [-7")
 
 
+def test_fewer_episodes_of_each_task_are_the_first_starts() -> None:
+    two = [{"metrics": {"successes": [True, False]}}, {"metrics": {"successes": [False, True]}}]
+    one = [{"metrics": {"successes": [True]}}, {"metrics": {"successes": [False]}}]
+    assert policies.by_start(two, "successes") == [True, False, False, True]
+    assert policies.by_start(one, "successes") == [True, False]
+
+
 @pytest.mark.slow
 def test_a_policy_is_trained_and_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
