@@ -13,8 +13,9 @@ from PIL import Image
 from safetensors.torch import load
 
 from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint, weights_fingerprint
-from tests.extended.hub.conftest import Machine, read
+from tests.extended.hub.conftest import TRAIN, Machine, read
 from tests.extended.hub.server import Hub
+from tests.flags import SMALL_WORLD_MODEL
 
 PYTHON_BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 PULL = """
@@ -107,6 +108,41 @@ def test_a_trained_policy_arrives_to_the_byte_and_its_card_works(
     )
     assert result.status == 0, result.output
     assert result.lines[-1] == ("(1, 5, 24) True" if repo_id == "user/wm" else "(1, 4) True")
+
+
+@pytest.fixture(scope="module")
+def published(machine: Machine, checkpoints: dict[str, Path], demos_commit: str, runs: Path) -> None:
+    """The world model trained again, stopped and resumed, as user/resumed; and a policy on a folder's latents."""
+    train = (
+        f"train --policy.type=wm_rssm {SMALL_WORLD_MODEL} {TRAIN} --policy.repo_id=user/resumed --save_freq=1"
+    )
+    resumed, latents = runs / "resumed", runs / "latents"
+    last = resumed / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    for command in (
+        f"{train} --steps=1 --dataset.repo_id=user/demos --dataset.revision={demos_commit} --output_dir={resumed}",
+        f"train --config_path={last} --resume=true --steps=2",
+        f"encode --world_model_path={checkpoints['user/wm']} --device=cpu --dataset.repo_id=user/demos "
+        f"--output_repo_id=user/of_a_folder --output_root={latents}",
+        f"train --policy.type=wm_bc --policy.world_model_path={checkpoints['user/wm']} {TRAIN} "
+        f"--policy.repo_id=user/wm_bc --dataset.repo_id=user/of_a_folder --dataset.root={latents} "
+        f"--output_dir={runs / 'wm_bc'}",
+    ):
+        result = machine.run(command)
+        assert result.status == 0, result.output
+
+
+@pytest.mark.parametrize("repo_id", ["user/wm", "user/resumed", "user/wm_iql", "user/wm_bc"])
+def test_the_command_on_a_card_trains_the_same_weights(
+    repo_id: str, hub: Hub, machine: Machine, published: None, runs: Path, tmp_path: Path
+) -> None:
+    card = ModelCard(read(hub, "model", repo_id, "README.md").decode())
+    assert str(runs) not in card.text
+    [command] = re.findall(r"lerobot-wm (train --config_path=.*)", card.text)
+    again = tmp_path / "again"
+    result = machine.run(command.replace("outputs/again", str(again)), token="read-user", empty_home=True)
+    assert result.status == 0, result.output
+    weights = again / "checkpoints/last/pretrained_model/model.safetensors"
+    assert weights.read_bytes() == read(hub, "model", repo_id, "model.safetensors")
 
 
 def test_a_policy_holds_the_pinned_world_model(hub: Hub, checkpoints: dict[str, Path]) -> None:
