@@ -1,0 +1,277 @@
+"""Few-shot transfer: policies for five tasks that the world model has not seen, from a few demonstrations of each.
+
+    python results/few_shot/few_shot.py --list
+    python results/few_shot/few_shot.py --arms=frozen,scratch --demonstrations=1,5 --seeds=0
+
+A world model learns from ML45's 45 training tasks, and one policy from N demonstrations of each of its five test tasks,
+all on different positions. Policies are rolled out on 50 other positions of each task. The demonstrations of the
+training tasks are those of `lerobot-wm experiment --preset=mt50_hand`. A repeated command keeps what is finished and
+resumes the rest.
+"""
+
+import argparse
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from lerobot.common.train_utils import get_step_checkpoint_dir
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import OPTIMIZER_PARAM_GROUPS, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
+from rich.console import Console
+
+from lerobot_wm.constants import ENV_TYPE, ML45_TEST, RECORDS_NAME
+from lerobot_wm.envs.tasks import all_tasks, resolve_tasks
+from lerobot_wm.experiment.plan import Plan
+from lerobot_wm.experiment.preset import load_preset
+from lerobot_wm.experiment.runner import Runner, Times, minutes_text
+from lerobot_wm.experiment.stage import Checkpoint, Dataset, Stage, in_order, lerobot_wm, unfinished
+from lerobot_wm.files import sole_writer
+from lerobot_wm.system import usable_cores
+from lerobot_wm.train.resume import can_resume
+
+MOST_DEMONSTRATIONS = 25  # of a test task
+MT50 = load_preset("mt50_hand")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command that makes a checkpoint.
+
+    Args:
+        kind: What it makes. Two arms whose steps are equal so far share them.
+        flags: Of `lerobot-wm train`. {previous} is the checkpoint of the step before.
+        steps: Of the training; 0 for `lerobot-wm init`, which trains nothing.
+        minutes: It takes about so long, until one of its kind was measured.
+        is_pretraining: On the training tasks, with all their demonstrations; else on N of each test task.
+    """
+
+    kind: str
+    flags: str
+    steps: int
+    minutes: float
+    is_pretraining: bool = False
+
+
+WORLD_MODEL = (
+    "--policy.type=wm_rssm --policy.rssm.standardize_images=true --policy.rssm.decode_share=0.2 "
+    "--policy.rssm.kl_scale=0.3 --policy.rssm.reward_scale=100 --policy.rssm.action_scale=2000 "
+    "--policy.rssm.image_shift=4 --policy.rssm.hidden_action_share=0.5 --policy.window_length=16 "
+    "--policy.lr_decay_share=0.2 --batch_size=4"
+)
+BC = "--policy.lr_decay_share=0.5 --batch_size=256"
+ON_LATENTS = f"--policy.type=wm_bc --policy.world_model_path={{previous}} {BC}"
+ON_IMAGES = (
+    "--policy.finetune_world_model=true --policy.random_crop_pad=4 --policy.lr_decay_share=0.5 --batch_size=8"
+)
+
+PRETRAINED = Step("pretrained", WORLD_MODEL, 40_000, 80, is_pretraining=True)
+ALL_TASKS = Step("all_tasks", ON_LATENTS, 40_000, 15, is_pretraining=True)
+POLICY = Step("policy", ON_LATENTS, 6_000, 2)
+# The policies of the test tasks, each the last of its steps.
+ARMS = {
+    "frozen": [PRETRAINED, POLICY],
+    "fine_tuned": [
+        PRETRAINED,
+        Step("fine_tuned", "--policy.path={previous} --policy.lr=3e-4 --batch_size=4", 2_000, 4),
+        POLICY,
+    ],
+    "joint": [
+        PRETRAINED,
+        Step("joint", f"--policy.type=wm_bc --policy.world_model_path={{previous}} {ON_IMAGES}", 2_000, 10),
+    ],
+    "policy": [PRETRAINED, ALL_TASKS, Step("policy_on", f"--policy.path={{previous}} {BC}", 6_000, 2)],
+    "policy_joint": [
+        PRETRAINED,
+        ALL_TASKS,
+        Step("policy_on_joint", f"--policy.path={{previous}} {ON_IMAGES}", 2_000, 10),
+    ],
+    "demonstrations_only": [Step("world_model", WORLD_MODEL, 6_000, 12), POLICY],
+    "scratch": [
+        Step(
+            "scratch",
+            "--policy.type=e2e_bc --policy.random_crop_pad=4 --policy.lr_decay_share=0.5 --batch_size=128",
+            3_000,
+            12,
+        )
+    ],
+    "backbone": [
+        Step("backbone", "--policy.type=frozen_backbone --policy.backbone=resnet18", 0, 0.3),
+        POLICY,
+    ],
+    "untrained": [Step("untrained", "--policy.type=wm_rssm", 0, 0.3), POLICY],
+    "proprioception": [
+        Step("proprioception", f"--policy.type=wm_bc --policy.use_latent=false {BC}", 6_000, 2)
+    ],
+}
+MINUTES = {step.kind: step.minutes for arm in ARMS.values() for step in arm}
+MINUTES |= {"collect": MT50.minutes["collect"], "collect_test": 4, "evaluate": 5}
+
+
+def few_demonstrations(output_dir: Path) -> Dataset:
+    """One demonstration of each test task on each of the first variations of set 42."""
+    few = replace(
+        MT50,
+        name="few_shot",
+        tasks="ml45_test",
+        episodes_per_task=MOST_DEMONSTRATIONS,
+        variations=f"0-{MOST_DEMONSTRATIONS - 1}",
+    )
+    collection = Plan(few, output_dir, MT50.variation_set).demonstrations()
+    # The other collection is twenty times as long.
+    return replace(collection, made_by=replace(collection.made_by, name="test_tasks", kind="collect_test"))
+
+
+def first_of_each(tasks: list[int], of_each: int, count: int) -> list[int]:
+    """The first `count` episodes of tasks, of a collection with `of_each` episodes of every task."""
+    return [task * of_each + episode for task in tasks for episode in range(count)]
+
+
+def pretraining_tasks(count: int) -> list[int]:
+    """Of ML45's training tasks, so many, by their places in MT50.
+
+    They are spread over the alphabet, in which tasks that resemble each other are neighbours.
+    """
+    ml45 = resolve_tasks("ml45")
+    return [all_tasks().index(ml45[i * len(ml45) // count]) for i in range(count)]
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Builds the stages of the arms.
+
+    Args:
+        pretraining: The demonstrations of the training tasks.
+        output_dir: Where everything else is written.
+        n_tasks: How many of the 45 training tasks the world model sees.
+        n_demonstrations: Of each test task.
+        seed: Of all training.
+        variation_set: That policies are rolled out on.
+    """
+
+    pretraining: Dataset
+    output_dir: Path
+    n_tasks: int
+    n_demonstrations: int
+    seed: int
+    variation_set: int
+
+    def checkpoint(self, steps: list[Step]) -> Checkpoint:
+        """What the last of these steps makes."""
+        *before, step = steps
+        previous = self.checkpoint(before) if before else None
+        kinds = "-".join(each.kind for each in steps)
+        seen = f"{self.n_tasks}_tasks" if steps[0].is_pretraining else "no_pretraining"
+        if step.is_pretraining:
+            data = self.pretraining
+            episodes = first_of_each(
+                pretraining_tasks(self.n_tasks), MT50.episodes_per_task, MT50.episodes_per_task
+            )
+        else:
+            data = few_demonstrations(self.output_dir)
+            episodes = first_of_each(list(range(len(ML45_TEST))), MOST_DEMONSTRATIONS, self.n_demonstrations)
+            seen += f"/{self.n_demonstrations}_demonstrations" if step.steps else ""
+        name = f"{seen}/{kinds}_{self.seed}"
+        folder = self.output_dir / name
+        needs = (data.made_by, *([previous.made_by] if previous else []))
+        flags = step.flags.format(previous=previous and previous.path).split()
+        settings = {**data.flags(), "seed": self.seed, "output_dir": folder}
+        if not step.steps:
+            path = folder / PRETRAINED_MODEL_DIR
+            argv = lerobot_wm("init", settings, *flags)
+            return Checkpoint(Stage(name, step.kind, argv, folder, path, needs), path)
+        settings |= {
+            "steps": step.steps,
+            "save_freq": 1000,
+            "dataset.episodes": f"[{','.join(map(str, episodes))}]",
+            "policy.push_to_hub": "false",
+            "policy.device": "cpu",
+        }
+        final = get_step_checkpoint_dir(folder, step.steps, step.steps)
+        last = folder / "checkpoints" / "last" / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
+        stage = Stage(
+            name=name,
+            kind=step.kind,
+            argv=lerobot_wm("train", settings, *flags),
+            folder=folder,
+            artefact=final / TRAINING_STATE_DIR / OPTIMIZER_PARAM_GROUPS,
+            needs=needs,
+            checkpoint=last,
+            can_resume=can_resume,
+            resume_argv=lerobot_wm("train", {"config_path": last, "resume": "true"}),
+        )
+        return Checkpoint(stage, final / PRETRAINED_MODEL_DIR)
+
+    def evaluation(self, arm: str) -> Stage:
+        """Rollouts on 50 positions of each test task, none of which has a demonstration."""
+        policy = self.checkpoint(ARMS[arm])
+        name = f"{policy.made_by.name}_eval_{self.variation_set}"
+        folder = self.output_dir / name
+        flags = {
+            "policy.path": policy.path,
+            "env.type": ENV_TYPE,
+            "env.task": "ml45_test",
+            "env.variation_set": self.variation_set,
+            "env.camera_name": MT50.camera_name,
+            "env.episode_length": MT50.episode_length,
+            "eval.n_episodes": 50,
+            "videos_per_task": 2,
+            "seed": 0,
+            "output_dir": folder,
+            "arm": f"{arm}-{self.n_tasks if ARMS[arm][0].is_pretraining else 0}-{self.n_demonstrations}",
+            "preset": "few_shot",
+        }
+        argv = lerobot_wm("eval", flags)
+        return Stage(
+            name, "evaluate", argv, folder, folder / RECORDS_NAME, (policy.made_by,), takes_workers=True
+        )
+
+
+def main() -> None:
+    """Run the stages of the arms that were asked for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--arms", default=",".join(ARMS))
+    parser.add_argument("--demonstrations", default="1,5,10,25", help="of each task")
+    parser.add_argument("--seeds", default="0,1,2")
+    parser.add_argument("--tasks", default="45", help="that the world model is pretrained on: 5,15,45")
+    parser.add_argument("--variation_set", type=int, default=44, help="of rollouts: 43 to tune, 44 to report")
+    parser.add_argument("--processes", type=int, default=usable_cores())
+    parser.add_argument("--output_dir", type=Path, default=Path("outputs/few_shot"))
+    parser.add_argument("--list", action="store_true", help="only print the stages, and their minutes")
+    arguments = parser.parse_args()
+    output_dir: Path = arguments.output_dir
+    pretraining = Plan(MT50, output_dir.parent / MT50.name, MT50.variation_set).demonstrations()
+    numbers = {
+        name: [int(each) for each in vars(arguments)[name].split(",")]
+        for name in ("tasks", "demonstrations", "seeds")
+    }
+    stages = [
+        Transfer(pretraining, output_dir, tasks, count, seed, arguments.variation_set).evaluation(arm)
+        for tasks in numbers["tasks"]
+        for count in numbers["demonstrations"]
+        for seed in numbers["seeds"]
+        for arm in arguments.arms.split(",")
+    ]
+    times, console = Times(output_dir / "times.json", MINUTES), Console()
+    if arguments.list:
+        for name, stage in in_order(stages).items():
+            state = "finished" if stage.is_finished else minutes_text(times.minutes(stage.kind))
+            console.print(f"{name}: {state}", highlight=False)
+        return
+    with sole_writer(output_dir) as lock:
+        runner = Runner(
+            unfinished(stages),
+            arguments.processes,
+            usable_cores(),
+            times,
+            console,
+            on_finish=lambda stage: None,
+        )
+        failed = runner.run(lock)
+    if failed:
+        sys.exit(f"Failed: {', '.join(stage.name for stage in failed)}; see their logs.")
+
+
+if __name__ == "__main__":
+    main()
