@@ -184,7 +184,8 @@ def _example(config: PolicyConfig, settings: dict) -> str:
 def train_command(repo_id: str, cfg: TrainPipelineConfig, latents: LatentRecord | None) -> str:
     """The command that repeats a run, from the settings that are published with its checkpoint.
 
-    Places on the machine that trained are replaced. The world model of a policy is in its checkpoint.
+    Places on the machine that trained are replaced, except a folder that --policy.path named. The world model of a
+    policy is in its checkpoint.
 
     Args:
         repo_id: Where the checkpoint is published.
@@ -194,10 +195,11 @@ def train_command(repo_id: str, cfg: TrainPipelineConfig, latents: LatentRecord 
     flags = {"config_path": repo_id, "dataset.root": "null"}
     if latents is not None:
         flags |= {"dataset.repo_id": latents.source_repo_id, "dataset.revision": "null"}
-    if getattr(cfg.policy, "world_model_path", None) is not None:
-        flags["policy.world_model_path"] = repo_id
-    if cfg.resume:
+    if cfg.resume:  # from its own checkpoint, which then stands where the one of --policy.path does
         flags |= {"resume": "false", "policy.pretrained_path": "null"}
+    started_new = cfg.resume or cfg.policy.pretrained_path is None
+    if started_new and getattr(cfg.policy, "world_model_path", None) is not None:
+        flags["policy.world_model_path"] = repo_id
     flags |= {"policy.push_to_hub": "false", "output_dir": "outputs/again"}
     return " ".join(
         ["lerobot-wm train", *(shlex.quote(f"--{name}={value}") for name, value in flags.items())]

@@ -112,7 +112,7 @@ def test_a_trained_policy_arrives_to_the_byte_and_its_card_works(
 
 @pytest.fixture(scope="module")
 def published(machine: Machine, checkpoints: dict[str, Path], demos_commit: str, runs: Path) -> None:
-    """The world model trained again, stopped and resumed, as user/resumed; and a policy on a folder's latents."""
+    """The world model trained again, stopped and resumed, a policy on a folder's latents, and one trained on."""
     train = (
         f"train --policy.type=wm_rssm {SMALL_WORLD_MODEL} {TRAIN} --policy.repo_id=user/resumed --save_freq=1"
     )
@@ -126,12 +126,14 @@ def published(machine: Machine, checkpoints: dict[str, Path], demos_commit: str,
         f"train --policy.type=wm_bc --policy.world_model_path={checkpoints['user/wm']} {TRAIN} "
         f"--policy.repo_id=user/wm_bc --dataset.repo_id=user/of_a_folder --dataset.root={latents} "
         f"--output_dir={runs / 'wm_bc'}",
+        f"train --policy.path=user/wm_iql {TRAIN} --policy.repo_id=user/tuned --dataset.repo_id=user/demos "
+        f"--output_dir={runs / 'tuned'}",
     ):
         result = machine.run(command)
         assert result.status == 0, result.output
 
 
-@pytest.mark.parametrize("repo_id", ["user/wm", "user/resumed", "user/wm_iql", "user/wm_bc"])
+@pytest.mark.parametrize("repo_id", ["user/wm", "user/resumed", "user/wm_iql", "user/wm_bc", "user/tuned"])
 def test_the_command_on_a_card_trains_the_same_weights(
     repo_id: str, hub: Hub, machine: Machine, published: None, runs: Path, tmp_path: Path
 ) -> None:
