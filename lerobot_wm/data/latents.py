@@ -65,6 +65,7 @@ class LatentRecord:
         source_fingerprint: `dataset_fingerprint` of the image dataset.
         tasks: Task strings in order of task_index.
         camera_shapes: (C, H, W) in the image dataset of each camera that was encoded.
+        random_crop_pad: Largest shift of the images of `observation.shifted_latents`, in pixels; 0 without them.
     """
 
     world_model_fingerprint: str
@@ -72,6 +73,7 @@ class LatentRecord:
     source_fingerprint: str
     tasks: list[str]
     camera_shapes: dict[str, list[int]] = field(default_factory=dict)
+    random_crop_pad: int = 0
 
     @property
     def made_of(self) -> dict[str, str]:
@@ -80,6 +82,7 @@ class LatentRecord:
             "world_model_fingerprint": self.world_model_fingerprint,
             "source_fingerprint": self.source_fingerprint,
             "cameras": ", ".join(self.camera_shapes),
+            "random_crop_pad": str(self.random_crop_pad),
         }
 
     def write(self, root: Path) -> None:
@@ -123,6 +126,18 @@ class LatentRecord:
                 f"These latents are of world model {self.world_model_fingerprint}, but {path} is world model "
                 f"{fingerprint}: the policy would see different states when it acts. Encode {self.source_repo_id} with "
                 "this world model, or give the world model of the latents."
+            )
+
+    def check_random_crop_pad(self, pad: int) -> None:
+        """Check that there are latents of shifted images for a policy that is trained on them.
+
+        Raises:
+            ValueError: There are none, or their images were shifted by other numbers of pixels.
+        """
+        if pad not in (0, self.random_crop_pad):
+            raise ValueError(
+                f"--policy.random_crop_pad={pad}, but these latents were encoded with --random_crop_pad="
+                f"{self.random_crop_pad}: encode {self.source_repo_id} with {pad}, or leave the flag out."
             )
 
     def check_cameras(self, cameras: list[str], path: str | None) -> None:

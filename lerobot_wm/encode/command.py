@@ -33,6 +33,8 @@ class EncodeConfig:
         output_root: Folder of the latent dataset; must not exist yet.
         rename_map: The world model's names for cameras and proprioception of the dataset, where they differ, as in
             `lerobot-train`. Features in the latent dataset keep the dataset's own names.
+        random_crop_pad: Also encode each image shifted at random by up to so many pixels, eight times, for a policy
+            with `--policy.random_crop_pad`; 0 for none.
         device: Device of the world model; None selects the fastest one.
         shard: Which of several jobs this is: 1/4 is the first of four. Each job encodes its part of the episodes into
             `<output_root>.parts`; when all are in one folder, the same command without this flag makes the dataset.
@@ -48,6 +50,7 @@ class EncodeConfig:
     output_repo_id: str
     output_root: Path
     rename_map: dict[str, str] = field(default_factory=dict)
+    random_crop_pad: int = 0
     device: str | None = None
     shard: str | None = None
     push_to_hub: bool = False
@@ -70,13 +73,20 @@ def _run(cfg: EncodeConfig, job: Job | None) -> None:
     policy.to(cfg.device or auto_select_torch_device())
     source = cfg.dataset.open()
     if job is not None:
-        encode_job(policy, source, cfg.output_root, job, rename_map=cfg.rename_map)
+        encode_job(
+            policy,
+            source,
+            cfg.output_root,
+            job,
+            rename_map=cfg.rename_map,
+            random_crop_pad=cfg.random_crop_pad,
+        )
         return
     if cfg.push_to_hub and cfg.output_root.exists():
         # An earlier push did not finish.
         check_same_settings(
             LatentRecord.read(cfg.output_root).made_of,
-            latent_record(policy, source, cfg.rename_map).made_of,
+            latent_record(policy, source, cfg.rename_map, cfg.random_crop_pad).made_of,
             f"{cfg.output_root} has latents",
             "choose another --output_root, or remove it",
         )
@@ -88,6 +98,7 @@ def _run(cfg: EncodeConfig, job: Job | None) -> None:
             cfg.output_repo_id,
             cfg.output_root,
             rename_map=cfg.rename_map,
+            random_crop_pad=cfg.random_crop_pad,
         )
     print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames -> {cfg.output_root}")
     if cfg.push_to_hub:

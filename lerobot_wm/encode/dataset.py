@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import torch
 from lerobot.datasets.compute_stats import get_feature_stats
@@ -25,7 +26,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wm.constants import OBS_LATENT
+from lerobot_wm.constants import OBS_LATENT, OBS_SHIFTED_LATENTS
 from lerobot_wm.data.cache import cache_root
 from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
 from lerobot_wm.data.source import dataset_folder, is_snapshot
@@ -48,6 +49,7 @@ logger = logging.getLogger(__name__)
 # Prefix of latent datasets in the cache of an image dataset.
 LATENTS_PREFIX = "latents-"
 _EPISODES_PER_BATCH = 16
+_SHIFTED_COPIES = 8
 
 
 def episode_batches(dataset: LeRobotDataset) -> list[range]:
@@ -63,6 +65,7 @@ def filter_batches(
     batches: Sequence[range],
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
+    random_crop_pad: int = 0,
 ) -> Iterator[Tensor]:
     """Encode some batches of a dataset's episodes; images of other episodes are not decoded.
 
@@ -71,9 +74,11 @@ def filter_batches(
         source: The image dataset.
         batches: Some of its `episode_batches`, in their order.
         rename_map: Names that the world model has for features of the dataset.
+        random_crop_pad: Largest random shift of images, in pixels; 0 for none.
 
     Yields:
-        The latents s_t of each batch, (N, L) float32 on the CPU.
+        The latents s_t of each batch, (N, 1, L) float32 on the CPU; with `random_crop_pad` (N, 1 + K, L), the last K of
+        images that are shifted at random.
     """
     world_model = policy.eval().world_model
     chosen = [episode for batch in batches for episode in batch]
@@ -87,14 +92,19 @@ def filter_batches(
     for batch in batches:
         of_batch = episodes[start : start + len(batch)]
         start += len(batch)
-        embeds, actions = embed_episodes(world_model, of_batch)
-        latents = world_model.filter_embeds(embeds, actions).latent.cpu()  # (B, T, L)
-        yield torch.cat([latents[i, : len(episode)] for i, episode in enumerate(of_batch)])
+        copies = []
+        with torch.random.fork_rng():
+            torch.manual_seed(batch.start)  # the same shifts in a resumed run, and in one of several jobs
+            for pad in [0, *[random_crop_pad] * (_SHIFTED_COPIES if random_crop_pad else 0)]:
+                embeds, actions = embed_episodes(world_model, of_batch, pad)
+                latents = world_model.filter_embeds(embeds, actions).latent.cpu()  # (B, T, L)
+                copies.append(torch.cat([latents[i, : len(each)] for i, each in enumerate(of_batch)]))
+        yield torch.stack(copies, dim=1)
 
 
 @dataclass(frozen=True)
 class LatentBatches:
-    """A folder of latents with a file `<first>-<last episode>.safetensors`, (N, L), for each batch of episodes.
+    """A folder of latents with a file `<first>-<last episode>.safetensors`, (N, 1 + K, L), for each batch of episodes.
 
     Attributes:
         folder: The folder.
@@ -121,6 +131,7 @@ class LatentBatches:
         source: LeRobotDataset,
         batches: Sequence[range],
         rename_map: Mapping[str, str],
+        random_crop_pad: int,
     ) -> None:
         """Encode the batches that are not in the folder yet, see `filter_batches`.
 
@@ -135,9 +146,11 @@ class LatentBatches:
             return
         first_frames = source.meta.episodes["dataset_from_index"]
         with tqdm(total=sum(map(len, missing)), desc="Encoding", unit="episode") as bar:
-            encoded = filter_batches(policy, source, missing, rename_map=rename_map)
+            encoded = filter_batches(
+                policy, source, missing, rename_map=rename_map, random_crop_pad=random_crop_pad
+            )
             for batch, latents in zip(missing, encoded, strict=True):
-                is_finite = latents.isfinite().all(dim=1)  # (N,)
+                is_finite = latents.isfinite().all(dim=(1, 2))  # (N,)
                 if not is_finite.all():
                     row = first_frames[batch.start] + int(is_finite.int().argmin())
                     raise ValueError(
@@ -149,7 +162,7 @@ class LatentBatches:
                 bar.update(len(batch))
 
     def read(self, batches: Sequence[range]) -> Tensor:
-        """The latents of these batches, (N, L) float32."""
+        """The latents of these batches, (N, 1 + K, L) float32."""
         return torch.cat([load_file(self._path(batch))[OBS_LATENT] for batch in batches])
 
     def _path(self, batch: range) -> Path:
@@ -174,6 +187,7 @@ def encode(
     output_root: Path,
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
+    random_crop_pad: int = 0,
 ) -> LeRobotDataset:
     """Write a copy of a dataset with `observation.latent` (L,) instead of its cameras.
 
@@ -186,6 +200,8 @@ def encode(
         output_repo_id: Repository id of the result.
         output_root: Folder of the result.
         rename_map: Names that the world model has for features of the dataset.
+        random_crop_pad: Adds `observation.shifted_latents` (K, L), of each image shifted at random K times by up to so
+            many pixels, for a policy to be trained on; 0 for none.
 
     Returns:
         The latent dataset.
@@ -195,16 +211,19 @@ def encode(
         ValueError: The dataset lacks a camera of the world model or proprioception, or has actions of another size
             than it was trained with, or latents are not finite.
     """
-    record, latent_batches = _begin(policy, source, output_root, rename_map)
+    record, latent_batches = _begin(policy, source, output_root, rename_map, random_crop_pad)
     batches = episode_batches(source)
-    latent_batches.encode_missing(policy, source, batches, rename_map)
-    latents = latent_batches.read(batches).numpy()  # (N, L), in the dataset's order
+    latent_batches.encode_missing(policy, source, batches, rename_map, random_crop_pad)
+    latents, shifted = np.split(latent_batches.read(batches).numpy(), [1], axis=1)  # (N, 1, L), (N, K, L)
+    latents = latents[:, 0]  # (N, L), in the dataset's order
     with appears_whole(output_root) as temporary:
         with quiet():
-            feature = {"dtype": "float32", "shape": latents.shape[1:], "names": None}
-            encoded = modify_features(
-                source, {OBS_LATENT: (latents, feature)}, source.meta.camera_keys, temporary, output_repo_id
-            )
+            added = {OBS_LATENT: latents} | ({OBS_SHIFTED_LATENTS: shifted} if random_crop_pad else {})
+            features = {
+                key: (values, {"dtype": "float32", "shape": values.shape[1:], "names": None})
+                for key, values in added.items()
+            }
+            encoded = modify_features(source, features, source.meta.camera_keys, temporary, output_repo_id)
         _remove_cameras_from_episodes(temporary, source.meta.camera_keys)
         # `modify_features` computes no statistics of new features.
         stats = get_feature_stats(latents, axis=0, keepdims=False)
@@ -233,14 +252,15 @@ def encode_job(
     job: Job,
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
+    random_crop_pad: int = 0,
 ) -> None:
     """Encode one job's part of a dataset into `<output_root>.parts`; `encode` makes a dataset of all parts.
 
     Raises what `encode` does.
     """
-    _, latent_batches = _begin(policy, source, output_root, rename_map)
+    _, latent_batches = _begin(policy, source, output_root, rename_map, random_crop_pad)
     batches = episode_batches(source)
-    latent_batches.encode_missing(policy, source, job.select(batches), rename_map)
+    latent_batches.encode_missing(policy, source, job.select(batches), rename_map, random_crop_pad)
     done = len(batches) - len(latent_batches.missing(batches))
     print(
         f"Job {job.index}/{job.count} is done: {done} of {len(batches)} batches are in {latent_batches.folder}. "
@@ -253,10 +273,11 @@ def _begin(
     source: LeRobotDataset,
     output_root: Path,
     rename_map: Mapping[str, str],
+    random_crop_pad: int,
 ) -> tuple[LatentRecord, LatentBatches]:
     """Check that the dataset can be encoded; returns the record of the result and the place of its latents."""
     folder = parts_folder(output_root)
-    record = latent_record(policy, source, rename_map)
+    record = latent_record(policy, source, rename_map, random_crop_pad)
     if output_root.exists():
         # A run that was killed at its very end may have left the parts of this very dataset.
         with suppress(ValueError):
@@ -270,7 +291,7 @@ def _begin(
 
 
 def latent_record(
-    policy: EncoderPolicy, source: LeRobotDataset, rename_map: Mapping[str, str]
+    policy: EncoderPolicy, source: LeRobotDataset, rename_map: Mapping[str, str], random_crop_pad: int
 ) -> LatentRecord:
     """The record of the latents that `encode` would make."""
     features = renamed(policy_features(source.meta), rename_map)
@@ -280,6 +301,7 @@ def latent_record(
         source_fingerprint=dataset_fingerprint(Path(source.root)),
         tasks=[str(task) for task in source.meta.tasks.index],
         camera_shapes={key: list(features[key].shape) for key in policy.config.cameras if key in features},
+        random_crop_pad=random_crop_pad,
     )
 
 
@@ -289,6 +311,7 @@ def encode_to_cache(
     meta: LeRobotDatasetMetadata,
     device: str,
     rename_map: Mapping[str, str] = OWN_NAMES,
+    random_crop_pad: int = 0,
 ) -> Path:
     """Encode a dataset with a world model into the dataset's cache, unless it is there.
 
@@ -298,6 +321,7 @@ def encode_to_cache(
         meta: Its metadata.
         device: Device of the world model.
         rename_map: See `encode`.
+        random_crop_pad: See `encode`.
 
     Returns:
         Folder of the latent dataset.
@@ -310,8 +334,9 @@ def encode_to_cache(
         source = LeRobotDataset(repo_id, revision=root.name)
     else:
         source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
-    names: dict[str, Any] = {"rename_map": sorted(rename_map.items())} if rename_map else {}
-    fingerprint = encoder_fingerprint(policy.world_model, cameras=policy.config.cameras, **names)
+    further: dict[str, Any] = {"rename_map": sorted(rename_map.items())} if rename_map else {}
+    further |= {"random_crop_pad": random_crop_pad} if random_crop_pad else {}
+    fingerprint = encoder_fingerprint(policy.world_model, cameras=policy.config.cameras, **further)
     name = f"{LATENTS_PREFIX}{fingerprint}-{dataset_fingerprint(root)}"
     output_root = cache_root(root) / name
     # Another training may be encoding it.
@@ -321,5 +346,12 @@ def encode_to_cache(
         else:
             logger.info("Encoding all %d episodes of %s into %s", meta.total_episodes, repo_id, output_root)
             check_finite_dataset(source)
-            encode(policy, source, f"{repo_id}_latents", output_root, rename_map=rename_map)
+            encode(
+                policy,
+                source,
+                f"{repo_id}_latents",
+                output_root,
+                rename_map=rename_map,
+                random_crop_pad=random_crop_pad,
+            )
     return output_root

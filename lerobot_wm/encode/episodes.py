@@ -11,7 +11,7 @@ from torch.nn.utils.rnn import pad_sequence
 from lerobot_wm.constants import ACTION
 from lerobot_wm.data.cache import camera_frames
 from lerobot_wm.data.tables import column_tensor
-from lerobot_wm.nn.images import stack_images
+from lerobot_wm.nn.images import random_crop, stack_images
 from lerobot_wm.policies.common.features import join_vectors
 from lerobot_wm.world_model.interface import LatentModel
 
@@ -98,10 +98,17 @@ def read_episodes(
     return read
 
 
-def embed_episodes(world_model: LatentModel, episodes: Sequence[Episode]) -> tuple[Tensor, Tensor]:
+def embed_episodes(
+    world_model: LatentModel, episodes: Sequence[Episode], random_crop_pad: int = 0
+) -> tuple[Tensor, Tensor]:
     """Embed the images of B episodes, and pad the shorter ones at their end.
 
     The filter is causal: padding after the last frame does not change an episode's latents.
+
+    Args:
+        world_model: Embeds them.
+        episodes: The B episodes.
+        random_crop_pad: Largest random shift of each image, in pixels.
 
     Returns:
         e_t (B, T, E) and a_t (B, T, A) on the model's device.
@@ -109,14 +116,14 @@ def embed_episodes(world_model: LatentModel, episodes: Sequence[Episode]) -> tup
     device = next(world_model.parameters()).device
     embeds = []
     for episode in episodes:
-        chunks = [
-            world_model.embed(
-                episode.images(chunk, device)[None],
-                None if episode.proprio is None else episode.proprio[chunk][None].to(device),
-            )[0]
-            for start in range(0, len(episode), _FRAMES_PER_CHUNK)
-            for chunk in [slice(start, start + _FRAMES_PER_CHUNK)]
-        ]
+        chunks = []
+        for start in range(0, len(episode), _FRAMES_PER_CHUNK):
+            steps = slice(start, start + _FRAMES_PER_CHUNK)
+            images = episode.images(steps, device)  # (N, K·C, H, W)
+            if random_crop_pad:
+                images = random_crop(images, random_crop_pad)
+            proprio = None if episode.proprio is None else episode.proprio[steps][None].to(device)
+            chunks.append(world_model.embed(images[None], proprio)[0])
         embeds.append(torch.cat(chunks))  # (T, E)
     actions = pad_sequence([episode.actions for episode in episodes], batch_first=True)
     return pad_sequence(embeds, batch_first=True), actions.to(device)

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 PAPER_SIZE = 64  # its kernels below fix it: 64-31-14-6-2 down, 1-5-13-30-64 up
 _CHANNELS = (32, 64, 128, 256)
 _HALVINGS = 2 ** len(_CHANNELS)
+ACTIVATIONS = {"relu": nn.ReLU, "elu": nn.ELU}
 
 
 class _ParityConvTranspose(torch.autograd.Function):
@@ -57,19 +58,19 @@ class UpsamplingConv(nn.ConvTranspose2d):
 
 
 class ConvEncoder(nn.Module):
-    """Four convolutions (kernel 4, stride 2) with ReLU: image -> features.
+    """Four convolutions (kernel 4, stride 2), each with an activation: image -> features.
 
     Padding is 0 for 64x64, as in the paper, and 1 for other sizes, which are halved exactly.
     """
 
-    def __init__(self, image_channels: int, image_size: int = PAPER_SIZE) -> None:
+    def __init__(self, image_channels: int, image_size: int = PAPER_SIZE, activation: str = "relu") -> None:
         super().__init__()
         is_paper = image_size == PAPER_SIZE
         self.embed_dim = _CHANNELS[-1] * (2 if is_paper else image_size // _HALVINGS) ** 2  # 1024 for 64x64
         layers: list[nn.Module] = []
         for c_in, c_out in pairwise((image_channels, *_CHANNELS)):
             conv = nn.Conv2d(c_in, c_out, kernel_size=4, stride=2, padding=0 if is_paper else 1)
-            layers += [conv, nn.ReLU(inplace=True)]
+            layers += [conv, ACTIVATIONS[activation](inplace=True)]
         self.layers = nn.Sequential(*layers)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -165,11 +166,13 @@ class DoublingDecoder(nn.Module):
         return self.layers(hidden.contiguous(memory_format=torch.channels_last))
 
 
-def make_encoder(image_channels: int, image_size: int, n_keypoints: int) -> ConvEncoder | KeypointEncoder:
-    """The paper's encoder, or one of keypoints."""
+def make_encoder(
+    image_channels: int, image_size: int, n_keypoints: int, activation: str = "relu"
+) -> ConvEncoder | KeypointEncoder:
+    """The paper's encoder, with its activation or another, or an encoder of keypoints."""
     if n_keypoints:
         return KeypointEncoder(image_channels, image_size, n_keypoints)
-    return ConvEncoder(image_channels, image_size)
+    return ConvEncoder(image_channels, image_size, activation)
 
 
 def make_decoder(latent_dim: int, image_channels: int, image_size: int, n_keypoints: int) -> nn.Module:

@@ -98,7 +98,14 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
     if encoder is not None:
         if cfg.dataset.episodes is not None:
             check_all_episodes_are_there(cfg, meta)
-        encoded = encode_to_cache(encoder, cfg.dataset.repo_id, meta, str(policy.device), cfg.rename_map)
+        encoded = encode_to_cache(
+            encoder,
+            cfg.dataset.repo_id,
+            meta,
+            str(policy.device),
+            cfg.rename_map,
+            policy.random_crop_pad,
+        )
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None
 
@@ -148,11 +155,13 @@ def check_latents_are_there(cfg: TrainPipelineConfig) -> None:
     root = Path(cfg.dataset.root or ".")
     if root.exists() or not root.name.startswith(LATENTS_PREFIX):
         return
-    rename_map = f" --rename_map='{json.dumps(cfg.rename_map)}'" if cfg.rename_map else ""
+    others = f" --rename_map='{json.dumps(cfg.rename_map)}'" if cfg.rename_map else ""
+    if cfg.policy.random_crop_pad:
+        others += f" --random_crop_pad={cfg.policy.random_crop_pad}"
     raise FileNotFoundError(
         f"Latents not found at {root}. To create them again, encode the image dataset: lerobot-wm encode "
         f"--world_model_path={cfg.checkpoint_path / PRETRAINED_MODEL_DIR} --dataset.repo_id=... --dataset.root=... "
-        f"--output_repo_id={cfg.dataset.repo_id} --output_root={root}{rename_map}"
+        f"--output_repo_id={cfg.dataset.repo_id} --output_root={root}{others}"
     )
 
 

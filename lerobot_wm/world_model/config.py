@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from lerobot_wm.nn.conv import ACTIVATIONS
+
 
 @dataclass
 class RSSMConfig:
@@ -35,6 +37,8 @@ class RSSMConfig:
             under shifts it has to locate the goal.
         n_keypoints: Number of keypoints that the encoder looks for; e_t is their coordinates, and the decoder is
             normalized. 0 flattens feature maps, as in the paper.
+        encoder_activation: "relu", as in the paper, or "elu". Under ReLU most units of the encoder soon output zero for
+            every image, and what is left says little of objects that training did not show.
         predict_reward: Whether there is a reward head. Turned off for datasets without a reward.
         use_proprio: Encode and reconstruct proprioception beside the image (the variant that the paper discarded).
         image_size: Height and width S of the images that the model sees, a multiple of 16; the paper's is 64. Time and
@@ -59,6 +63,7 @@ class RSSMConfig:
     action_horizon: int = 1
     image_shift: int = 0
     n_keypoints: int = 0
+    encoder_activation: str = "relu"
     predict_reward: bool = True
     use_proprio: bool = False
     image_size: int = 64
@@ -73,6 +78,10 @@ class RSSMConfig:
             raise ValueError(f"hidden_action_share is {self.hidden_action_share:g}; expected 0 to 1.")
         if self.image_size < 32 or self.image_size % 16:
             raise ValueError(f"image_size is {self.image_size}; expected a multiple of 16, at least 32.")
+        if self.encoder_activation not in ACTIVATIONS:
+            raise ValueError(
+                f"encoder_activation is {self.encoder_activation!r}; expected one of {', '.join(ACTIVATIONS)}."
+            )
         if self.min_std <= 0:
             raise ValueError(f"min_std is {self.min_std:g}; expected a standard deviation above 0.")
         if self.action_horizon < 1:

@@ -30,7 +30,7 @@ class WorldModel(LatentModel):
         super().__init__()
         self.config = config
         image = config.image_channels, config.image_size, config.n_keypoints
-        self.encoder = make_encoder(*image)
+        self.encoder = make_encoder(*image, config.encoder_activation)
         embed_dim = self.encoder.embed_dim
         self.rssm = RSSM(config, embed_dim)
         self.decoder = make_decoder(config.latent_dim, *image)
@@ -49,8 +49,11 @@ class WorldModel(LatentModel):
 
     @property
     def encoding_settings(self) -> dict[str, Any]:
-        """Whether the filter is given the actions."""
-        return {"hidden_actions": True} if self.config.hidden_action_share else {}
+        """Whether the filter is given the actions, and an activation other than the paper's."""
+        settings: dict[str, Any] = {"hidden_actions": True} if self.config.hidden_action_share else {}
+        if self.config.encoder_activation != "relu":
+            settings["encoder_activation"] = self.config.encoder_activation
+        return settings
 
     def embed(self, images: Tensor, proprio: Tensor | None = None) -> Tensor:
         """Compute the image embeddings e_t.

@@ -55,7 +55,8 @@ class Step:
 WORLD_MODEL = (
     "--policy.type=wm_rssm --policy.rssm.standardize_images=true --policy.rssm.decode_share=0.2 "
     "--policy.rssm.kl_scale=0.3 --policy.rssm.reward_scale=100 --policy.rssm.action_scale=2000 "
-    "--policy.rssm.image_shift=4 --policy.rssm.hidden_action_share=0.5 --policy.window_length=16 "
+    "--policy.rssm.image_shift=4 --policy.rssm.hidden_action_share=0.5 --policy.rssm.encoder_activation=elu "
+    "--policy.window_length=16 "
     "--policy.lr_decay_share=0.2 --batch_size=4"
 )
 BC = "--policy.lr_decay_share=0.5 --batch_size=256"
@@ -66,7 +67,12 @@ ON_IMAGES = (
 
 PRETRAINED = Step("pretrained", WORLD_MODEL, 40_000, 80, is_pretraining=True)
 ALL_TASKS = Step("all_tasks", ON_LATENTS, 40_000, 15, is_pretraining=True)
-POLICY = Step("policy", ON_LATENTS, 6_000, 2)
+POLICY = Step(
+    "policy",
+    f"{ON_LATENTS} --policy.random_crop_pad=4 --policy.use_memory=false --policy.dropout=0.5",
+    6_000,
+    2,
+)
 # The policies of the test tasks, each the last of its steps.
 ARMS = {
     "frozen": [PRETRAINED, POLICY],

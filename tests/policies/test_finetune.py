@@ -112,7 +112,6 @@ def test_a_policy_without_a_world_model_has_none_to_train() -> None:
 @pytest.mark.parametrize(
     ("flag", "named"),
     [
-        ({"random_crop_pad": 4}, "finetune_world_model=true"),
         ({"random_crop_pad": -1, "finetune_world_model": True}, "random_crop_pad=-1"),
         ({"window_length": 0, "finetune_world_model": True}, "window_length=0"),
     ],

@@ -31,6 +31,8 @@ class LatentPolicyConfig(ActingConfig):
             happened so far, and then fails where nobody has been.
         use_environment_state: True adds the simulator's full state, `observation.environment_state`. With
             `use_latent=false` this is the control that knows the truth. The environment has to provide it.
+        random_crop_pad: Largest random shift of training images, in pixels; 0 leaves them. Each image is encoded with
+            eight random shifts, and training chooses one of them each time. From few demonstrations a policy needs it.
         save_predicted_video: True lets `lerobot-eval` write a video of each batch of rollouts beside its own
             (`pred_episode_N.mp4`): what the world model expected to see at every step, and to its right what it saw.
         world_model, image_key, world_model_fingerprint: Taken from that checkpoint when the policy is created.
@@ -40,9 +42,15 @@ class LatentPolicyConfig(ActingConfig):
     use_latent: bool = True
     use_memory: bool = True
     use_environment_state: bool = False
+    random_crop_pad: int = 0
     save_predicted_video: bool = False
     world_model: WorldModelConfig | None = None
     world_model_fingerprint: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.random_crop_pad < 0:
+            raise ValueError(f"--policy.random_crop_pad={self.random_crop_pad}: expected pixels, 0 or more.")
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -166,6 +174,7 @@ class LatentPolicyConfig(ActingConfig):
             )
         record.check_world_model(self.world_model_fingerprint, self.world_model_path)
         record.check_cameras(self.cameras, self.world_model_path)
+        record.check_random_crop_pad(self.random_crop_pad)
         for key, shape in record.camera_shapes.items():
             self.input_features[key] = PolicyFeature(FeatureType.VISUAL, tuple(shape))
         std = torch.as_tensor((dataset_meta.stats or {})[OBS_LATENT]["std"]).median().item()

@@ -1,7 +1,7 @@
 """A policy on the latents of a frozen world model: in training it reads them, at test time it filters images."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -10,7 +10,7 @@ from lerobot.policies.factory import get_policy_class
 from torch import Tensor, nn
 from torchvision.utils import make_grid
 
-from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
+from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT, OBS_SHIFTED_LATENTS
 from lerobot_wm.data.latents import weights_fingerprint
 from lerobot_wm.nn.images import camera_images, side_by_side
 from lerobot_wm.nn.normalize import Affine
@@ -144,9 +144,17 @@ class LatentPolicy(ActingPolicy):
         return self.observation(
             self.state_at(batch, t),
             tasks,
-            frame(OBS_LATENT) if self.config.use_latent else None,
+            self._latent(frame) if self.config.use_latent else None,
             frame(OBS_ENV_STATE) if self.config.use_environment_state else None,
         )
+
+    def _latent(self, frame: Callable[[str], Tensor]) -> Tensor:
+        """s_t of a training batch, (B, L), given its features at t; with `random_crop_pad`, of shifted images."""
+        if not (self.training and self.config.reads_stored_latents and self.config.random_crop_pad):
+            return frame(OBS_LATENT)
+        shifted = frame(OBS_SHIFTED_LATENTS)  # (B, K, L)
+        rows = torch.arange(len(shifted), device=shifted.device)
+        return shifted[rows, torch.randint(shifted.shape[1], rows.shape, device=shifted.device)]
 
     def reset(self) -> None:
         """Forget the episode: the next call of `select_action` starts a new filter."""

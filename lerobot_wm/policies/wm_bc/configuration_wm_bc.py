@@ -17,15 +17,13 @@ class WMBCConfig(BCPolicyConfig, LatentPolicyConfig):
 
     Args:
         finetune_world_model: Trains the world model's encoder and filter together with the head, from windows of
-            images. It starts as pretrained. Each step then costs about as much as one of the world model.
+            images, with `random_crop_pad` shifted all alike. It starts as pretrained. Each step then costs about as
+            much as one of the world model.
         window_length: Frames T of such a window, whose filter starts from the zero state.
-        random_crop_pad: Largest random shift of a window's images in fine-tuning, in pixels, the same for all of its
-            frames; 0 leaves them.
     """
 
     finetune_world_model: bool = False
     window_length: int = 16
-    random_crop_pad: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -34,16 +32,8 @@ class WMBCConfig(BCPolicyConfig, LatentPolicyConfig):
                 "--policy.finetune_world_model=true, but --policy.use_latent=false leaves the world model out: give "
                 "one of the two flags."
             )
-        if self.window_length < 1 or self.random_crop_pad < 0:
-            raise ValueError(
-                f"--policy.window_length={self.window_length} --policy.random_crop_pad={self.random_crop_pad}: "
-                "expected at least 1 frame, and 0 pixels or more."
-            )
-        if self.random_crop_pad and not self.finetune_world_model:
-            raise ValueError(
-                f"--policy.random_crop_pad={self.random_crop_pad} shifts images, but this policy trains on latents: "
-                "leave the flag out, or add --policy.finetune_world_model=true."
-            )
+        if self.window_length < 1:
+            raise ValueError(f"--policy.window_length={self.window_length}: expected at least 1 frame.")
 
     def validate_features(self) -> None:
         """Also check that the world model can be trained.
