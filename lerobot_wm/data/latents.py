@@ -56,6 +56,21 @@ RECORD_PATH = "meta/latents.json"
 
 
 @dataclass(frozen=True)
+class LatentKind:
+    """Which latents of images a policy reads.
+
+    Attributes:
+        use_memory: Of the filter, s_t = [d_t, z_t]. False encodes each frame by itself, as the first of an episode, and
+            keeps z_t alone.
+        random_crop_pad: Adds `observation.shifted_latents` (K, L), of each image shifted at random K times by up to so
+            many pixels; 0 for none.
+    """
+
+    use_memory: bool = True
+    random_crop_pad: int = 0
+
+
+@dataclass(frozen=True)
 class LatentRecord:
     """What a latent dataset was made from, stored in its `meta/latents.json`.
 
@@ -65,7 +80,7 @@ class LatentRecord:
         source_fingerprint: `dataset_fingerprint` of the image dataset.
         tasks: Task strings in order of task_index.
         camera_shapes: (C, H, W) in the image dataset of each camera that was encoded.
-        random_crop_pad: Largest shift of the images of `observation.shifted_latents`, in pixels; 0 without them.
+        kind: Which latents they are.
     """
 
     world_model_fingerprint: str
@@ -73,7 +88,7 @@ class LatentRecord:
     source_fingerprint: str
     tasks: list[str]
     camera_shapes: dict[str, list[int]] = field(default_factory=dict)
-    random_crop_pad: int = 0
+    kind: LatentKind = LatentKind()
 
     @property
     def made_of(self) -> dict[str, str]:
@@ -82,7 +97,7 @@ class LatentRecord:
             "world_model_fingerprint": self.world_model_fingerprint,
             "source_fingerprint": self.source_fingerprint,
             "cameras": ", ".join(self.camera_shapes),
-            "random_crop_pad": str(self.random_crop_pad),
+            **{name: str(value) for name, value in asdict(self.kind).items()},
         }
 
     def write(self, root: Path) -> None:
@@ -105,9 +120,11 @@ class LatentRecord:
             )
         try:
             record = json.loads(path.read_text(encoding="utf-8"))
+            kind = LatentKind(**record.pop("kind", {}))
             # Release 0.2.0 could store samples of z_t.
             return cls(
-                **{key: value for key, value in record.items() if key not in ("sampled", "sample_seed")}
+                kind=kind,
+                **{key: value for key, value in record.items() if key not in ("sampled", "sample_seed")},
             )
         except (ValueError, TypeError, AttributeError) as error:
             raise ValueError(
@@ -128,16 +145,18 @@ class LatentRecord:
                 "this world model, or give the world model of the latents."
             )
 
-    def check_random_crop_pad(self, pad: int) -> None:
-        """Check that there are latents of shifted images for a policy that is trained on them.
+    def check_kind(self, wanted: LatentKind) -> None:
+        """Check that these are the latents that a policy reads, or that it can do without their shifted copies.
 
         Raises:
-            ValueError: There are none, or their images were shifted by other numbers of pixels.
+            ValueError: They are not.
         """
-        if pad not in (0, self.random_crop_pad):
+        pad = self.kind.random_crop_pad
+        if wanted.use_memory != self.kind.use_memory or wanted.random_crop_pad not in (0, pad):
             raise ValueError(
-                f"--policy.random_crop_pad={pad}, but these latents were encoded with --random_crop_pad="
-                f"{self.random_crop_pad}: encode {self.source_repo_id} with {pad}, or leave the flag out."
+                f"The policy has --policy.use_memory={wanted.use_memory} and --policy.random_crop_pad="
+                f"{wanted.random_crop_pad}, but its latents were encoded with --use_memory={self.kind.use_memory} and "
+                f"--random_crop_pad={pad}: encode {self.source_repo_id} with the policy's settings."
             )
 
     def check_cameras(self, cameras: list[str], path: str | None) -> None:

@@ -10,7 +10,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.device_utils import auto_select_torch_device
 
 from lerobot_wm.constants import OBS_LATENT
-from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
+from lerobot_wm.data.latents import LatentKind, LatentRecord, dataset_fingerprint
 from lerobot_wm.data.source import SourceConfig
 from lerobot_wm.encode.dataset import encode, encode_job, latent_record
 from lerobot_wm.errors import check_can_push
@@ -33,6 +33,7 @@ class EncodeConfig:
         output_root: Folder of the latent dataset; must not exist yet.
         rename_map: The world model's names for cameras and proprioception of the dataset, where they differ, as in
             `lerobot-train`. Features in the latent dataset keep the dataset's own names.
+        use_memory: False encodes each frame by itself, for a policy with `--policy.use_memory=false`.
         random_crop_pad: Also encode each image shifted at random by up to so many pixels, eight times, for a policy
             with `--policy.random_crop_pad`; 0 for none.
         device: Device of the world model; None selects the fastest one.
@@ -50,6 +51,7 @@ class EncodeConfig:
     output_repo_id: str
     output_root: Path
     rename_map: dict[str, str] = field(default_factory=dict)
+    use_memory: bool = True
     random_crop_pad: int = 0
     device: str | None = None
     shard: str | None = None
@@ -71,7 +73,7 @@ def main() -> None:
 def _run(cfg: EncodeConfig, job: Job | None) -> None:
     policy = load_encoder(cfg.world_model_path)
     policy.to(cfg.device or auto_select_torch_device())
-    source = cfg.dataset.open()
+    source, kind = cfg.dataset.open(), LatentKind(cfg.use_memory, cfg.random_crop_pad)
     if job is not None:
         encode_job(
             policy,
@@ -79,14 +81,14 @@ def _run(cfg: EncodeConfig, job: Job | None) -> None:
             cfg.output_root,
             job,
             rename_map=cfg.rename_map,
-            random_crop_pad=cfg.random_crop_pad,
+            kind=kind,
         )
         return
     if cfg.push_to_hub and cfg.output_root.exists():
         # An earlier push did not finish.
         check_same_settings(
             LatentRecord.read(cfg.output_root).made_of,
-            latent_record(policy, source, cfg.rename_map, cfg.random_crop_pad).made_of,
+            latent_record(policy, source, cfg.rename_map, kind).made_of,
             f"{cfg.output_root} has latents",
             "choose another --output_root, or remove it",
         )
@@ -98,7 +100,7 @@ def _run(cfg: EncodeConfig, job: Job | None) -> None:
             cfg.output_repo_id,
             cfg.output_root,
             rename_map=cfg.rename_map,
-            random_crop_pad=cfg.random_crop_pad,
+            kind=kind,
         )
     print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames -> {cfg.output_root}")
     if cfg.push_to_hub:

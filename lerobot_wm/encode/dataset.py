@@ -8,7 +8,7 @@ import logging
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from lerobot_wm.constants import OBS_LATENT, OBS_SHIFTED_LATENTS
 from lerobot_wm.data.cache import cache_root
-from lerobot_wm.data.latents import LatentRecord, dataset_fingerprint
+from lerobot_wm.data.latents import LatentKind, LatentRecord, dataset_fingerprint
 from lerobot_wm.data.source import dataset_folder, is_snapshot
 from lerobot_wm.data.tables import check_finite_dataset
 from lerobot_wm.encode.episodes import embed_episodes, read_episodes
@@ -50,6 +50,7 @@ logger = logging.getLogger(__name__)
 LATENTS_PREFIX = "latents-"
 _EPISODES_PER_BATCH = 16
 _SHIFTED_COPIES = 8
+_PLAIN = LatentKind()
 
 
 def episode_batches(dataset: LeRobotDataset) -> list[range]:
@@ -65,7 +66,7 @@ def filter_batches(
     batches: Sequence[range],
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
-    random_crop_pad: int = 0,
+    kind: LatentKind = _PLAIN,
 ) -> Iterator[Tensor]:
     """Encode some batches of a dataset's episodes; images of other episodes are not decoded.
 
@@ -74,13 +75,12 @@ def filter_batches(
         source: The image dataset.
         batches: Some of its `episode_batches`, in their order.
         rename_map: Names that the world model has for features of the dataset.
-        random_crop_pad: Largest random shift of images, in pixels; 0 for none.
+        kind: Which latents.
 
     Yields:
-        The latents s_t of each batch, (N, 1, L) float32 on the CPU; with `random_crop_pad` (N, 1 + K, L), the last K of
-        images that are shifted at random.
+        The latents of each batch, (N, 1, L) float32 on the CPU; with shifted copies (N, 1 + K, L), them last.
     """
-    world_model = policy.eval().world_model
+    world_model, memory_dim = policy.eval().world_model, encoder_config(policy).memory_dim
     chosen = [episode for batch in batches for episode in batch]
     episodes = read_episodes(
         LeRobotDataset(source.repo_id, source.root, chosen, revision=source.revision),
@@ -95,9 +95,13 @@ def filter_batches(
         copies = []
         with torch.random.fork_rng():
             torch.manual_seed(batch.start)  # the same shifts in a resumed run, and in one of several jobs
-            for pad in [0, *[random_crop_pad] * (_SHIFTED_COPIES if random_crop_pad else 0)]:
+            for pad in [0, *[kind.random_crop_pad] * (_SHIFTED_COPIES if kind.random_crop_pad else 0)]:
                 embeds, actions = embed_episodes(world_model, of_batch, pad)
-                latents = world_model.filter_embeds(embeds, actions).latent.cpu()  # (B, T, L)
+                if kind.use_memory:
+                    latents = world_model.filter_embeds(embeds, actions).latent  # (B, T, L)
+                else:
+                    latents = world_model.filter_frames(embeds, actions).latent[..., memory_dim:]
+                latents = latents.cpu()
                 copies.append(torch.cat([latents[i, : len(each)] for i, each in enumerate(of_batch)]))
         yield torch.stack(copies, dim=1)
 
@@ -131,7 +135,7 @@ class LatentBatches:
         source: LeRobotDataset,
         batches: Sequence[range],
         rename_map: Mapping[str, str],
-        random_crop_pad: int,
+        kind: LatentKind,
     ) -> None:
         """Encode the batches that are not in the folder yet, see `filter_batches`.
 
@@ -146,9 +150,7 @@ class LatentBatches:
             return
         first_frames = source.meta.episodes["dataset_from_index"]
         with tqdm(total=sum(map(len, missing)), desc="Encoding", unit="episode") as bar:
-            encoded = filter_batches(
-                policy, source, missing, rename_map=rename_map, random_crop_pad=random_crop_pad
-            )
+            encoded = filter_batches(policy, source, missing, rename_map=rename_map, kind=kind)
             for batch, latents in zip(missing, encoded, strict=True):
                 is_finite = latents.isfinite().all(dim=(1, 2))  # (N,)
                 if not is_finite.all():
@@ -187,7 +189,7 @@ def encode(
     output_root: Path,
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
-    random_crop_pad: int = 0,
+    kind: LatentKind = _PLAIN,
 ) -> LeRobotDataset:
     """Write a copy of a dataset with `observation.latent` (L,) instead of its cameras.
 
@@ -200,8 +202,7 @@ def encode(
         output_repo_id: Repository id of the result.
         output_root: Folder of the result.
         rename_map: Names that the world model has for features of the dataset.
-        random_crop_pad: Adds `observation.shifted_latents` (K, L), of each image shifted at random K times by up to so
-            many pixels, for a policy to be trained on; 0 for none.
+        kind: Which latents.
 
     Returns:
         The latent dataset.
@@ -211,14 +212,14 @@ def encode(
         ValueError: The dataset lacks a camera of the world model or proprioception, or has actions of another size
             than it was trained with, or latents are not finite.
     """
-    record, latent_batches = _begin(policy, source, output_root, rename_map, random_crop_pad)
+    record, latent_batches = _begin(policy, source, output_root, rename_map, kind)
     batches = episode_batches(source)
-    latent_batches.encode_missing(policy, source, batches, rename_map, random_crop_pad)
+    latent_batches.encode_missing(policy, source, batches, rename_map, kind)
     latents, shifted = np.split(latent_batches.read(batches).numpy(), [1], axis=1)  # (N, 1, L), (N, K, L)
     latents = latents[:, 0]  # (N, L), in the dataset's order
     with appears_whole(output_root) as temporary:
         with quiet():
-            added = {OBS_LATENT: latents} | ({OBS_SHIFTED_LATENTS: shifted} if random_crop_pad else {})
+            added = {OBS_LATENT: latents} | ({OBS_SHIFTED_LATENTS: shifted} if kind.random_crop_pad else {})
             features = {
                 key: (values, {"dtype": "float32", "shape": values.shape[1:], "names": None})
                 for key, values in added.items()
@@ -252,15 +253,15 @@ def encode_job(
     job: Job,
     *,
     rename_map: Mapping[str, str] = OWN_NAMES,
-    random_crop_pad: int = 0,
+    kind: LatentKind = _PLAIN,
 ) -> None:
     """Encode one job's part of a dataset into `<output_root>.parts`; `encode` makes a dataset of all parts.
 
     Raises what `encode` does.
     """
-    _, latent_batches = _begin(policy, source, output_root, rename_map, random_crop_pad)
+    _, latent_batches = _begin(policy, source, output_root, rename_map, kind)
     batches = episode_batches(source)
-    latent_batches.encode_missing(policy, source, job.select(batches), rename_map, random_crop_pad)
+    latent_batches.encode_missing(policy, source, job.select(batches), rename_map, kind)
     done = len(batches) - len(latent_batches.missing(batches))
     print(
         f"Job {job.index}/{job.count} is done: {done} of {len(batches)} batches are in {latent_batches.folder}. "
@@ -273,11 +274,11 @@ def _begin(
     source: LeRobotDataset,
     output_root: Path,
     rename_map: Mapping[str, str],
-    random_crop_pad: int,
+    kind: LatentKind,
 ) -> tuple[LatentRecord, LatentBatches]:
     """Check that the dataset can be encoded; returns the record of the result and the place of its latents."""
     folder = parts_folder(output_root)
-    record = latent_record(policy, source, rename_map, random_crop_pad)
+    record = latent_record(policy, source, rename_map, kind)
     if output_root.exists():
         # A run that was killed at its very end may have left the parts of this very dataset.
         with suppress(ValueError):
@@ -291,7 +292,7 @@ def _begin(
 
 
 def latent_record(
-    policy: EncoderPolicy, source: LeRobotDataset, rename_map: Mapping[str, str], random_crop_pad: int
+    policy: EncoderPolicy, source: LeRobotDataset, rename_map: Mapping[str, str], kind: LatentKind
 ) -> LatentRecord:
     """The record of the latents that `encode` would make."""
     features = renamed(policy_features(source.meta), rename_map)
@@ -301,7 +302,7 @@ def latent_record(
         source_fingerprint=dataset_fingerprint(Path(source.root)),
         tasks=[str(task) for task in source.meta.tasks.index],
         camera_shapes={key: list(features[key].shape) for key in policy.config.cameras if key in features},
-        random_crop_pad=random_crop_pad,
+        kind=kind,
     )
 
 
@@ -311,7 +312,7 @@ def encode_to_cache(
     meta: LeRobotDatasetMetadata,
     device: str,
     rename_map: Mapping[str, str] = OWN_NAMES,
-    random_crop_pad: int = 0,
+    kind: LatentKind = _PLAIN,
 ) -> Path:
     """Encode a dataset with a world model into the dataset's cache, unless it is there.
 
@@ -321,7 +322,7 @@ def encode_to_cache(
         meta: Its metadata.
         device: Device of the world model.
         rename_map: See `encode`.
-        random_crop_pad: See `encode`.
+        kind: See `encode`.
 
     Returns:
         Folder of the latent dataset.
@@ -335,7 +336,7 @@ def encode_to_cache(
     else:
         source = LeRobotDataset(repo_id, root=root, revision=meta.revision)
     further: dict[str, Any] = {"rename_map": sorted(rename_map.items())} if rename_map else {}
-    further |= {"random_crop_pad": random_crop_pad} if random_crop_pad else {}
+    further |= {name: value for name, value in asdict(kind).items() if value != getattr(_PLAIN, name)}
     fingerprint = encoder_fingerprint(policy.world_model, cameras=policy.config.cameras, **further)
     name = f"{LATENTS_PREFIX}{fingerprint}-{dataset_fingerprint(root)}"
     output_root = cache_root(root) / name
@@ -352,6 +353,6 @@ def encode_to_cache(
                 f"{repo_id}_latents",
                 output_root,
                 rename_map=rename_map,
-                random_crop_pad=random_crop_pad,
+                kind=kind,
             )
     return output_root

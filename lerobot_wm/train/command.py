@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from copy import deepcopy
+from dataclasses import asdict
 from pathlib import Path
 
 from lerobot.configs import FeatureType, PreTrainedConfig, parser
@@ -104,7 +105,7 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
             meta,
             str(policy.device),
             cfg.rename_map,
-            policy.random_crop_pad,
+            policy.latent_kind,
         )
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None
@@ -156,8 +157,8 @@ def check_latents_are_there(cfg: TrainPipelineConfig) -> None:
     if root.exists() or not root.name.startswith(LATENTS_PREFIX):
         return
     others = f" --rename_map='{json.dumps(cfg.rename_map)}'" if cfg.rename_map else ""
-    if cfg.policy.random_crop_pad:
-        others += f" --random_crop_pad={cfg.policy.random_crop_pad}"
+    for name, value in asdict(cfg.policy.latent_kind).items():
+        others += f" --{name}={value}"
     raise FileNotFoundError(
         f"Latents not found at {root}. To create them again, encode the image dataset: lerobot-wm encode "
         f"--world_model_path={cfg.checkpoint_path / PRETRAINED_MODEL_DIR} --dataset.repo_id=... --dataset.root=... "

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
+import torch
 from torch import Tensor, nn
 
 
@@ -52,6 +53,13 @@ class LatentModel(nn.Module, ABC):
 
         s_t may depend on a_{t-1} and earlier actions, never on a_t. A stochastic state is its distribution's mean.
         """
+
+    def filter_frames(self, embeds: Tensor, actions: Tensor) -> PlainState:
+        """Compute the states (B, T, ·) of frames, each as the first of an episode; see `filter_embeds`."""
+        single = self.filter_embeds(
+            embeds.flatten(0, 1)[:, None], torch.zeros_like(actions).flatten(0, 1)[:, None]
+        )
+        return PlainState(single.latent[:, 0].unflatten(0, embeds.shape[:2]))
 
     @abstractmethod
     def observe(

@@ -18,7 +18,7 @@ from lerobot_wm.collect.command import CollectConfig, collect
 from lerobot_wm.collect.merge import merge_datasets
 from lerobot_wm.collect.shards import SHARD_RECORD
 from lerobot_wm.data.cache import CACHE_VARIABLE
-from lerobot_wm.data.latents import LatentRecord
+from lerobot_wm.data.latents import LatentKind, LatentRecord
 from lerobot_wm.encode.dataset import encode, encode_job, episode_batches, filter_batches
 from lerobot_wm.policies.latent.policy import load_encoder
 from lerobot_wm.system import quiet
@@ -214,8 +214,8 @@ def test_latents_of_a_batch_do_not_depend_on_those_before(
 ) -> None:
     policy, batches = load_encoder(str(world_model_path)), episode_batches(many_episodes)
     assert batches == [range(16), range(16, 24)]
-    both = list(filter_batches(policy, many_episodes, batches, random_crop_pad=2))
-    [alone] = filter_batches(policy, many_episodes, batches[1:], random_crop_pad=2)
+    both = list(filter_batches(policy, many_episodes, batches, kind=LatentKind(random_crop_pad=2)))
+    [alone] = filter_batches(policy, many_episodes, batches[1:], kind=LatentKind(random_crop_pad=2))
     assert torch.equal(alone, both[1])
     assert len(torch.cat(both)) == many_episodes.num_frames
 

@@ -16,10 +16,10 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_wm.data.cache import CACHE_VARIABLE
-from lerobot_wm.data.latents import LatentRecord
-from lerobot_wm.encode.dataset import encode_to_cache
+from lerobot_wm.data.latents import LatentKind, LatentRecord
+from lerobot_wm.encode.dataset import encode_to_cache, episode_batches, filter_batches
 from lerobot_wm.policies.common.iql import IQLConfig
-from lerobot_wm.policies.latent.policy import LatentPolicy
+from lerobot_wm.policies.latent.policy import LatentPolicy, load_encoder
 from lerobot_wm.policies.wm_iql.modeling_wm_iql import WMIQLPolicy
 from tests.flags import DATASET_FLAGS, TRAIN_FLAGS
 
@@ -254,28 +254,37 @@ def test_blind_control_reads_no_image(
     assert (checkpoint / "model.safetensors").stat().st_size < 1_000_000
 
 
-def test_a_policy_without_memory_reads_what_the_current_frame_adds(
-    latents_root: Path,
+def test_a_policy_without_memory_reads_each_frame_by_itself(
     world_model_path: Path,
+    latents_root: Path,
     demos: LeRobotDataset,
     tmp_path: Path,
     lerobot_wm_command: Callable[..., None],
 ) -> None:
+    train = f"train --policy.type=wm_bc --policy.world_model_path={world_model_path} {TRAIN_FLAGS}"
+    train += " --policy.use_memory=false --steps=2 --batch_size=8"
+    with pytest.raises(ValueError, match="encoded with --use_memory=True"):
+        lerobot_wm_command(
+            f"{train} --dataset.repo_id=test/latents --dataset.root={latents_root}",
+            f"--output_dir={tmp_path / 'refused'}",
+        )
     lerobot_wm_command(
-        f"train --policy.type=wm_bc --policy.world_model_path={world_model_path} --policy.use_memory=false",
-        f"--steps=2 --batch_size=8 {TRAIN_FLAGS} --dataset.repo_id=test/latents --dataset.root={latents_root}",
+        f"{train} --dataset.repo_id=test/demos --dataset.root={demos.root}",
         f"--output_dir={tmp_path / 'run'}",
     )
     policy = get_policy_class("wm_bc").from_pretrained(tmp_path / "run/checkpoints/last/pretrained_model")
-    assert policy.select_action(frame(demos, 0)).shape == (1, 4)
-    latent = LeRobotDataset("test/latents", root=latents_root)[0]["observation.latent"][None]  # (1, L)
-    state, task = torch.zeros(1, policy.config.state_dim), torch.zeros(1, len(policy.config.tasks))
-    read = policy.observation(state, task, latent)
-    past, present = latent.clone(), latent.clone()
-    past[:, 0] += 1
-    present[:, -1] += 1
-    assert torch.equal(read, policy.observation(state, task, past))
-    assert not torch.equal(read, policy.observation(state, task, present))
+    action = policy.select_action(frame(demos, 5))
+    policy.select_action(frame(demos, 0))
+    assert torch.equal(policy.select_action(frame(demos, 5)), action)
+
+    encoder = load_encoder(str(world_model_path))
+    [latents] = filter_batches(encoder, demos, episode_batches(demos), kind=LatentKind(use_memory=False))
+    assert latents.shape == (demos.num_frames, 1, policy.config.latent_dim)
+    seen = frame(demos, 5)
+    observation = policy.observation(seen["observation.state"], policy.one_hot_tasks(seen, 1), latents[5])
+    torch.testing.assert_close(
+        policy.act(observation, seen["observation.state"]), action, atol=1e-4, rtol=1e-4
+    )
 
 
 def test_unknown_task(policy_paths: dict[str, Path], demos: LeRobotDataset) -> None:

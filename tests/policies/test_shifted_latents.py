@@ -82,7 +82,7 @@ def test_latents_without_shifts_are_refused(
     latents_root: Path, world_model_path: Path, lerobot_wm_command: Callable[..., None], tmp_path: Path
 ) -> None:
     latents = LeRobotDataset("test/latents", root=latents_root)
-    with pytest.raises(ValueError, match="random_crop_pad=2, but these latents were encoded with"):
+    with pytest.raises(ValueError, match="random_crop_pad=2, but its latents were encoded with"):
         lerobot_wm_command(
             f"train --policy.type=wm_bc --policy.world_model_path={world_model_path} --policy.random_crop_pad=2",
             f"--steps=1 {train_flags(latents)} --output_dir={tmp_path / 'run'}",

@@ -8,7 +8,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_wm.constants import OBS_ENV_STATE, OBS_LATENT
-from lerobot_wm.data.latents import RECORD_PATH, LatentRecord
+from lerobot_wm.data.latents import RECORD_PATH, LatentKind, LatentRecord
 from lerobot_wm.policies.common.acting_config import ActingConfig
 from lerobot_wm.policies.common.checkpoint import CheckpointError, open_checkpoint
 from lerobot_wm.policies.common.config import train_new
@@ -27,8 +27,8 @@ class LatentPolicyConfig(ActingConfig):
         world_model_path: Folder or Hub id of the checkpoint of a world model (wm_rssm) or of a frozen_backbone in its
             place; its frozen weights become part of this policy's.
         use_latent: False leaves the latent out: the blind control, which reads proprioception and task id only.
-        use_memory: False leaves d_t out of the latent [d_t, z_t]. A policy can recognize demonstrations by what has
-            happened so far, and then fails where nobody has been.
+        use_memory: False encodes each frame by itself, as the first of an episode, and keeps z_t of [d_t, z_t]. A
+            policy can recognize demonstrations by what has happened so far, and then fails where nobody has been.
         use_environment_state: True adds the simulator's full state, `observation.environment_state`. With
             `use_latent=false` this is the control that knows the truth. The environment has to provide it.
         random_crop_pad: Largest random shift of training images, in pixels; 0 leaves them. Each image is encoded with
@@ -68,6 +68,11 @@ class LatentPolicyConfig(ActingConfig):
         if self.world_model is None:
             return 0
         return self.world_model.latent_dim - (0 if self.use_memory else self.world_model.memory_dim)
+
+    @property
+    def latent_kind(self) -> LatentKind:
+        """Which latents the policy reads."""
+        return LatentKind(self.use_memory, self.random_crop_pad)
 
     @property
     def scales_latents(self) -> bool:
@@ -117,6 +122,11 @@ class LatentPolicyConfig(ActingConfig):
                 "would see nothing."
             )
         model = self.world_model
+        if self.save_predicted_video and not self.use_memory:
+            raise ValueError(
+                "--policy.save_predicted_video=true shows what the memory expects, and --policy.use_memory=false "
+                "has none: leave one of the two flags out."
+            )
         if self.save_predicted_video and (model is None or not model.predicts_images):
             raise ValueError(
                 f"--policy.save_predicted_video=true, but this {self.type} has no world model that predicts images (it "
@@ -174,7 +184,7 @@ class LatentPolicyConfig(ActingConfig):
             )
         record.check_world_model(self.world_model_fingerprint, self.world_model_path)
         record.check_cameras(self.cameras, self.world_model_path)
-        record.check_random_crop_pad(self.random_crop_pad)
+        record.check_kind(self.latent_kind)
         for key, shape in record.camera_shapes.items():
             self.input_features[key] = PolicyFeature(FeatureType.VISUAL, tuple(shape))
         std = torch.as_tensor((dataset_meta.stats or {})[OBS_LATENT]["std"]).median().item()

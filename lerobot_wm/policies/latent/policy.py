@@ -182,9 +182,10 @@ class LatentPolicy(ActingPolicy):
         """Advance the filter by one frame and return s_t, (B, L)."""
         images = camera_images(batch, self.config.cameras, self.config.image_size)  # (B, C, H, W)
         # LeRobot gives no batch size at reset, so the state is made when the first frame shows it.
-        if self._prev_action is None or self._prev_action.shape[0] != images.shape[0]:
+        previous = self._prev_action if self.config.use_memory else None
+        if previous is None or previous.shape[0] != images.shape[0]:
             self._filter_state = None
-            self._prev_action = images.new_zeros(images.shape[0], self.config.action_dim)
+            previous = images.new_zeros(images.shape[0], self.config.action_dim)
         assert self.config.world_model is not None
         proprio = join_vectors(batch, self.config.world_model.proprio_vectors)
         # In float32 even under autocast, as the latents that the policy was trained on. (On a GPU, LeRobot's own loops
@@ -192,7 +193,7 @@ class LatentPolicy(ActingPolicy):
         with torch.autocast(images.device.type, enabled=False):
             states = self.world_model.observe(
                 images[:, None],
-                self._prev_action[:, None],
+                previous[:, None],
                 self._filter_state,
                 None if proprio is None else proprio[:, None],
             )

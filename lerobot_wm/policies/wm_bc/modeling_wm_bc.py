@@ -58,7 +58,8 @@ class WMBCPolicy(BCPolicy, LatentPolicy):
             images = together.unflatten(1, images.shape[1:3])
         assert config.world_model is not None  # checked with the features
         embeds = self.world_model.embed(images, join_vectors(windows, config.world_model.proprio_vectors))
-        states = self.world_model.filter_embeds(embeds, windows[ACTION][:, :length])
+        filter_ = self.world_model.filter_embeds if config.use_memory else self.world_model.filter_frames
+        states = filter_(embeds, windows[ACTION][:, :length])
 
         vectors = [*config.state_vectors, *([OBS_ENV_STATE] if config.use_environment_state else [])]
         chunks = windows[ACTION].unfold(1, config.chunk_size, 1).movedim(-1, 2)  # (B, T, K, A)
