@@ -1,5 +1,6 @@
 """The experiment as stages: which command makes what, and from which other stage's result."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -147,20 +148,25 @@ class Plan:
 
     def _policy(self, arm: Arm, seed: int, task: str | None) -> Checkpoint:
         assert arm.training is not None
-        run, flags = arm.run, list(arm.train_flags)
+        run, flags, dataset = arm.run, list(arm.train_flags), self.demonstrations()
+        needs: list[Stage] = []
         if arm.encoder is not None:
-            dataset = self._latents(arm.encoder, seed)
-            flags.append(f"--policy.world_model_path={self._encoder(arm.encoder, seed).path}")
-        else:
-            dataset = self.demonstrations()
+            encoder = self._encoder(arm.encoder, seed)
+            flags.append(f"--policy.world_model_path={encoder.path}")
+            if arm.freezes_encoder:
+                dataset = self._latents(arm.encoder, seed)
+            else:
+                needs.append(encoder.made_by)
         if task is not None:
             # A collection's episodes are in the order of its tasks, the same number for each.
             count, position = self.preset.episodes_per_task, self.preset.task_names.index(task)
             episodes = ",".join(map(str, range(position * count, (position + 1) * count)))
             run, flags = f"{run}_{task}", [*flags, f"--dataset.episodes=[{episodes}]"]
-        return self._training(run, arm.training, seed, dataset, *flags)
+        return self._training(run, arm.training, seed, dataset, *flags, needs=needs)
 
-    def _training(self, run: str, training: str, seed: int, dataset: Dataset, *more: str) -> Checkpoint:
+    def _training(
+        self, run: str, training: str, seed: int, dataset: Dataset, *more: str, needs: Sequence[Stage] = ()
+    ) -> Checkpoint:
         name, config = f"seed_{seed}/{run}", config_file(self.output_dir, training)
         folder = self.output_dir / name
         steps = self.preset.trainings[training]["steps"]
@@ -175,7 +181,7 @@ class Plan:
             argv=lerobot_wm("train", {"config_path": config, "seed": seed, "job_name": run, **places}, *more),
             folder=folder,
             artefact=final / TRAINING_STATE_DIR / OPTIMIZER_PARAM_GROUPS,
-            needs=(dataset.made_by,),
+            needs=(dataset.made_by, *needs),
             checkpoint=last,
             can_resume=can_resume,
             resume_argv=lerobot_wm("train", {"config_path": last, "resume": "true", **places}),

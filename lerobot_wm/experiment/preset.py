@@ -33,7 +33,7 @@ class Preset:
         rollouts_per_task: Rollouts of each task, on that variation and those after it.
         episode_length: Steps after which a rollout is a failure.
         videos_per_task: Rollouts of each task that are filmed, the first ones.
-        arms: Arms that run by default, each with its training seeds.
+        arms: Arms that run by default, each with its training seeds; without seeds, an arm runs only when named.
         trainings: Settings of `lerobot-wm train` by name, complete but for dataset, seed and folder.
         minutes: Expected wall time of each kind of stage, used until one has been measured.
     """
@@ -77,7 +77,7 @@ def load_preset(name: str, configs: Path = CONFIGS) -> Preset:
         for pattern in data[table]:
             if not any(fnmatchcase(known, pattern) for known in names):
                 raise ValueError(f"{path}: '{pattern}' in '{table}' matches none of {', '.join(names)}.")
-    data["arms"] = {arm: seeds[-1] for arm in ARMS if (seeds := _matching(data["arms"], arm))}
+    data["arms"] = {arm: seeds[-1] for arm in ARMS if any(seeds := _matching(data["arms"], arm)[-1:])}
     trainings = {}
     for training, policy in TRAININGS.items():
         settings: dict[str, Any] = {"policy": {**policy, "push_to_hub": False}}

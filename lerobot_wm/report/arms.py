@@ -13,6 +13,14 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "wm_rssm": {"type": "wm_rssm"},
     "wm_bc": {"type": "wm_bc"},
     "wm_bc_single": {"type": "wm_bc"},
+    # On single frames: memory recognizes demonstrations by what has happened so far.
+    "joint_bc": {
+        "type": "wm_bc",
+        "finetune_world_model": True,
+        "window_length": 1,
+        "use_memory": False,
+        "random_crop_pad": 4,
+    },
     "wm_iql": {"type": "wm_iql"},
     "wm_iql_single": {"type": "wm_iql"},
     "e2e_bc": {"type": "e2e_bc"},
@@ -57,6 +65,7 @@ class Arm:
         description: As in the report.
         training: Key of `TRAININGS`; None for the scripted expert.
         encoder: Source of the latents that the policy reads; None for a policy on the demonstrations themselves.
+        freezes_encoder: Whether the policy learns from latents, and not from images together with the encoder.
         individual: One policy per task instead of one for all tasks.
         trained_as: Name of the training run whose checkpoint is rolled out; None for the arm's own name.
         train_flags: Further flags of `lerobot-wm train`.
@@ -67,6 +76,7 @@ class Arm:
     description: str
     training: str | None
     encoder: Encoder | None = None
+    freezes_encoder: bool = True
     individual: bool = False
     trained_as: str | None = None
     train_flags: tuple[str, ...] = ()
@@ -121,6 +131,13 @@ ARMS: dict[str, Arm] = {
         ),
         _WM_IQL,
         Arm("wm_bc", "BC on latents of the world model, one policy for all tasks", "wm_bc", WM_RSSM),
+        Arm(
+            "joint_bc",
+            "BC on single images, the encoder trained along from the world model's",
+            "joint_bc",
+            WM_RSSM,
+            freezes_encoder=False,
+        ),
         # The paper's IQL from images learns from the dense reward (section 4.3).
         Arm(
             "e2e_iql_dense",

@@ -30,6 +30,7 @@ from lerobot_wm.system import usable_cores
 from lerobot_wm.train.resume import can_resume
 
 MOST_DEMONSTRATIONS = 25  # of a test task
+FULL_STATE = "full_state"  # the control that sees no image and is told where everything is
 MT50 = load_preset("mt50_hand")
 
 
@@ -61,18 +62,29 @@ WORLD_MODEL = (
 )
 BC = "--policy.lr_decay_share=0.5 --batch_size=256"
 ON_LATENTS = f"--policy.type=wm_bc --policy.world_model_path={{previous}} {BC}"
-ON_IMAGES = (
-    "--policy.finetune_world_model=true --policy.random_crop_pad=4 --policy.lr_decay_share=0.5 --batch_size=8"
+ON_IMAGES = "--policy.random_crop_pad=4 --policy.lr_decay_share=0.5 --batch_size=128"
+# Single frames: memory harms in tasks that the world model has not seen (README.md).
+JOINTLY = (
+    "--policy.type=wm_bc --policy.world_model_path={previous} --policy.finetune_world_model=true "
+    f"--policy.window_length=1 --policy.use_memory=false {ON_IMAGES}"
 )
+FROM_IMAGES = f"--policy.type=e2e_bc {ON_IMAGES}"
 
-PRETRAINED = Step("pretrained", WORLD_MODEL, 40_000, 80, is_pretraining=True)
-ALL_TASKS = Step("all_tasks", ON_LATENTS, 40_000, 15, is_pretraining=True)
+PRETRAINED = Step("pretrained", WORLD_MODEL, 20_000, 40, is_pretraining=True)
+UNTRAINED = Step(
+    "untrained",
+    "--policy.type=wm_rssm --policy.rssm.standardize_images=true --policy.rssm.encoder_activation=elu",
+    0,
+    0.3,
+)
 POLICY = Step(
     "policy",
     f"{ON_LATENTS} --policy.random_crop_pad=4 --policy.use_memory=false --policy.dropout=0.5",
     6_000,
     2,
 )
+JOINT = Step("joint", JOINTLY, 3_000, 6)
+JOINT_ON = Step("joint_on", f"--policy.path={{previous}} {ON_IMAGES}", 2_000, 5)
 # The policies of the test tasks, each the last of its steps.
 ARMS = {
     "frozen": [PRETRAINED, POLICY],
@@ -81,32 +93,32 @@ ARMS = {
         Step("fine_tuned", "--policy.path={previous} --policy.lr=3e-4 --batch_size=4", 2_000, 4),
         POLICY,
     ],
-    "joint": [
+    "joint": [PRETRAINED, JOINT],
+    "joint_untrained": [UNTRAINED, JOINT],
+    "policy": [
         PRETRAINED,
-        Step("joint", f"--policy.type=wm_bc --policy.world_model_path={{previous}} {ON_IMAGES}", 2_000, 10),
+        Step("all_tasks", ON_LATENTS, 40_000, 15, is_pretraining=True),
+        Step("policy_on", f"--policy.path={{previous}} {BC}", 6_000, 2),
     ],
-    "policy": [PRETRAINED, ALL_TASKS, Step("policy_on", f"--policy.path={{previous}} {BC}", 6_000, 2)],
-    "policy_joint": [
-        PRETRAINED,
-        ALL_TASKS,
-        Step("policy_on_joint", f"--policy.path={{previous}} {ON_IMAGES}", 2_000, 10),
-    ],
+    "policy_joint": [PRETRAINED, Step("all_joint", JOINTLY, 10_000, 15, is_pretraining=True), JOINT_ON],
+    "policy_scratch": [Step("all_scratch", FROM_IMAGES, 10_000, 15, is_pretraining=True), JOINT_ON],
     "demonstrations_only": [Step("world_model", WORLD_MODEL, 6_000, 12), POLICY],
-    "scratch": [
-        Step(
-            "scratch",
-            "--policy.type=e2e_bc --policy.random_crop_pad=4 --policy.lr_decay_share=0.5 --batch_size=128",
-            3_000,
-            12,
-        )
-    ],
+    "scratch": [Step("scratch", FROM_IMAGES, 3_000, 6)],
     "backbone": [
         Step("backbone", "--policy.type=frozen_backbone --policy.backbone=resnet18", 0, 0.3),
         POLICY,
     ],
-    "untrained": [Step("untrained", "--policy.type=wm_rssm", 0, 0.3), POLICY],
+    "untrained": [UNTRAINED, POLICY],
     "proprioception": [
         Step("proprioception", f"--policy.type=wm_bc --policy.use_latent=false {BC}", 6_000, 2)
+    ],
+    FULL_STATE: [
+        Step(
+            FULL_STATE,
+            f"--policy.type=wm_bc --policy.use_latent=false --policy.use_environment_state=true {BC}",
+            6_000,
+            1,
+        )
     ],
 }
 MINUTES = {step.kind: step.minutes for arm in ARMS.values() for step in arm}
@@ -219,6 +231,7 @@ class Transfer:
             "env.variation_set": self.variation_set,
             "env.camera_name": MT50.camera_name,
             "env.episode_length": MT50.episode_length,
+            "env.environment_state": str(arm == FULL_STATE).lower(),
             "eval.n_episodes": 50,
             "videos_per_task": 2,
             "seed": 0,

@@ -122,6 +122,8 @@ def test_data_of_each_arm(tmp_path: Path) -> None:
         assert "--policy.reward_key=next.dense_reward" in stages[f"seed_0/{run}"].argv
     assert root("wm_bc") == root("wm_iql_sweep") == root(f"wm_bc_single_{MT6[0]}") == "seed_0/latents_wm_rssm"
     assert root("frozen_bc") == "seed_0/latents_frozen_backbone"
+    assert root("joint_bc") == "dataset"
+    assert stages["seed_0/wm_rssm"] in stages["seed_0/joint_bc"].needs
     door = ",".join(map(str, range(130, 260)))
     assert f"--dataset.episodes=[{door}]" in stages["seed_0/e2e_bc_single_door-open-v3"].argv
 
@@ -249,6 +251,7 @@ def test_runs_are_chosen_by_arms_and_seeds() -> None:
 
     assert chosen(["wm_bc"], []) == [("wm_bc", 0), ("wm_bc", 1), ("wm_bc", 2)]
     assert chosen(["expert", "wm_iql"], [4]) == [("wm_iql", 4), ("expert", 0)]
-    assert {name for name, _ in chosen([], [])} == set(preset.arms) == set(ARMS)
+    assert {name for name, _ in chosen([], [])} == set(preset.arms) == set(ARMS) - {"joint_bc"}
+    assert chosen(["joint_bc"], []) == [("joint_bc", 0)], "it runs when it is named"
     with pytest.raises(ValueError, match=r"wm_cb.*e2e_iql"):
         select_runs(preset, ["wm_cb"], [])
