@@ -75,14 +75,7 @@ def _run(cfg: EncodeConfig, job: Job | None) -> None:
     policy.to(cfg.device or auto_select_torch_device())
     source, kind = cfg.dataset.open(), LatentKind(cfg.use_memory, cfg.random_crop_pad)
     if job is not None:
-        encode_job(
-            policy,
-            source,
-            cfg.output_root,
-            job,
-            rename_map=cfg.rename_map,
-            kind=kind,
-        )
+        encode_job(policy, source, cfg.output_root, job, rename_map=cfg.rename_map, kind=kind)
         return
     if cfg.push_to_hub and cfg.output_root.exists():
         # An earlier push did not finish.

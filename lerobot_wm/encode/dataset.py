@@ -347,12 +347,5 @@ def encode_to_cache(
         else:
             logger.info("Encoding all %d episodes of %s into %s", meta.total_episodes, repo_id, output_root)
             check_finite_dataset(source)
-            encode(
-                policy,
-                source,
-                f"{repo_id}_latents",
-                output_root,
-                rename_map=rename_map,
-                kind=kind,
-            )
+            encode(policy, source, f"{repo_id}_latents", output_root, rename_map=rename_map, kind=kind)
     return output_root

@@ -153,10 +153,10 @@ class Plan:
         if arm.encoder is not None:
             encoder = self._encoder(arm.encoder, seed)
             flags.append(f"--policy.world_model_path={encoder.path}")
-            if arm.freezes_encoder:
-                dataset = self._latents(arm.encoder, seed)
-            else:
+            if self.preset.trainings[arm.training]["policy"].get("finetune_world_model"):
                 needs.append(encoder.made_by)
+            else:
+                dataset = self._latents(arm.encoder, seed)
         if task is not None:
             # A collection's episodes are in the order of its tasks, the same number for each.
             count, position = self.preset.episodes_per_task, self.preset.task_names.index(task)

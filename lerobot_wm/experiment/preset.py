@@ -77,7 +77,7 @@ def load_preset(name: str, configs: Path = CONFIGS) -> Preset:
         for pattern in data[table]:
             if not any(fnmatchcase(known, pattern) for known in names):
                 raise ValueError(f"{path}: '{pattern}' in '{table}' matches none of {', '.join(names)}.")
-    data["arms"] = {arm: seeds[-1] for arm in ARMS if any(seeds := _matching(data["arms"], arm)[-1:])}
+    data["arms"] = {arm: seeds[-1] for arm in ARMS if (seeds := _matching(data["arms"], arm)) and seeds[-1]}
     trainings = {}
     for training, policy in TRAININGS.items():
         settings: dict[str, Any] = {"policy": {**policy, "push_to_hub": False}}

@@ -65,7 +65,6 @@ class Arm:
         description: As in the report.
         training: Key of `TRAININGS`; None for the scripted expert.
         encoder: Source of the latents that the policy reads; None for a policy on the demonstrations themselves.
-        freezes_encoder: Whether the policy learns from latents, and not from images together with the encoder.
         individual: One policy per task instead of one for all tasks.
         trained_as: Name of the training run whose checkpoint is rolled out; None for the arm's own name.
         train_flags: Further flags of `lerobot-wm train`.
@@ -76,7 +75,6 @@ class Arm:
     description: str
     training: str | None
     encoder: Encoder | None = None
-    freezes_encoder: bool = True
     individual: bool = False
     trained_as: str | None = None
     train_flags: tuple[str, ...] = ()
@@ -136,7 +134,6 @@ ARMS: dict[str, Arm] = {
             "BC on single images, the encoder trained along from the world model's",
             "joint_bc",
             WM_RSSM,
-            freezes_encoder=False,
         ),
         # The paper's IQL from images learns from the dense reward (section 4.3).
         Arm(

@@ -100,12 +100,7 @@ def open_dataset_and_encode(cfg: TrainPipelineConfig) -> None:
         if cfg.dataset.episodes is not None:
             check_all_episodes_are_there(cfg, meta)
         encoded = encode_to_cache(
-            encoder,
-            cfg.dataset.repo_id,
-            meta,
-            str(policy.device),
-            cfg.rename_map,
-            policy.latent_kind,
+            encoder, cfg.dataset.repo_id, meta, str(policy.device), cfg.rename_map, policy.latent_kind
         )
         cfg.dataset.repo_id, cfg.dataset.root = f"{cfg.dataset.repo_id}_latents", str(encoded)
         cfg.dataset.revision = None

@@ -10,9 +10,11 @@ resumes the rest.
 """
 
 import argparse
+import json
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from lerobot.common.train_utils import get_step_checkpoint_dir
 from lerobot.configs.train import TRAIN_CONFIG_NAME
@@ -26,6 +28,7 @@ from lerobot_wm.experiment.preset import load_preset
 from lerobot_wm.experiment.runner import Runner, Times, minutes_text
 from lerobot_wm.experiment.stage import Checkpoint, Dataset, Stage, in_order, lerobot_wm, unfinished
 from lerobot_wm.files import sole_writer
+from lerobot_wm.report.arms import TRAININGS
 from lerobot_wm.system import usable_cores
 from lerobot_wm.train.resume import can_resume
 
@@ -53,30 +56,28 @@ class Step:
     is_pretraining: bool = False
 
 
-WORLD_MODEL = (
-    "--policy.type=wm_rssm --policy.rssm.standardize_images=true --policy.rssm.decode_share=0.2 "
-    "--policy.rssm.kl_scale=0.3 --policy.rssm.reward_scale=100 --policy.rssm.action_scale=2000 "
-    "--policy.rssm.image_shift=4 --policy.rssm.hidden_action_share=0.5 --policy.rssm.encoder_activation=elu "
-    "--policy.window_length=16 "
-    "--policy.lr_decay_share=0.2 --batch_size=4"
-)
+def policy_flags(settings: dict[str, Any], prefix: str = "policy") -> str:
+    """The flags of a policy's settings, which may be nested."""
+    return " ".join(
+        policy_flags(value, f"{prefix}.{name}")
+        if isinstance(value, dict)
+        else f"--{prefix}.{name}={json.dumps(value)}".replace('"', "")
+        for name, value in settings.items()
+    )
+
+
+# The settings of the preset, so that its demonstrations and its world model go together.
+UNTRAINED_MODEL = policy_flags(MT50.trainings["wm_rssm"]["policy"])
+WORLD_MODEL = f"{UNTRAINED_MODEL} --batch_size={MT50.trainings['wm_rssm']['batch_size']}"
 BC = "--policy.lr_decay_share=0.5 --batch_size=256"
 ON_LATENTS = f"--policy.type=wm_bc --policy.world_model_path={{previous}} {BC}"
 ON_IMAGES = "--policy.random_crop_pad=4 --policy.lr_decay_share=0.5 --batch_size=128"
 # Single frames: memory harms in tasks that the world model has not seen (README.md).
-JOINTLY = (
-    "--policy.type=wm_bc --policy.world_model_path={previous} --policy.finetune_world_model=true "
-    f"--policy.window_length=1 --policy.use_memory=false {ON_IMAGES}"
-)
+JOINTLY = f"{policy_flags(TRAININGS['joint_bc'])} --policy.world_model_path={{previous}} {ON_IMAGES}"
 FROM_IMAGES = f"--policy.type=e2e_bc {ON_IMAGES}"
 
 PRETRAINED = Step("pretrained", WORLD_MODEL, 20_000, 40, is_pretraining=True)
-UNTRAINED = Step(
-    "untrained",
-    "--policy.type=wm_rssm --policy.rssm.standardize_images=true --policy.rssm.encoder_activation=elu",
-    0,
-    0.3,
-)
+UNTRAINED = Step("untrained", UNTRAINED_MODEL, 0, 0.3)
 POLICY = Step(
     "policy",
     f"{ON_LATENTS} --policy.random_crop_pad=4 --policy.use_memory=false --policy.dropout=0.5",
@@ -109,17 +110,8 @@ ARMS = {
         POLICY,
     ],
     "untrained": [UNTRAINED, POLICY],
-    "proprioception": [
-        Step("proprioception", f"--policy.type=wm_bc --policy.use_latent=false {BC}", 6_000, 2)
-    ],
-    FULL_STATE: [
-        Step(
-            FULL_STATE,
-            f"--policy.type=wm_bc --policy.use_latent=false --policy.use_environment_state=true {BC}",
-            6_000,
-            1,
-        )
-    ],
+    "proprioception": [Step("proprioception", f"{policy_flags(TRAININGS['proprio_bc'])} {BC}", 6_000, 2)],
+    FULL_STATE: [Step(FULL_STATE, f"{policy_flags(TRAININGS['state_bc'])} {BC}", 6_000, 1)],
 }
 MINUTES = {step.kind: step.minutes for arm in ARMS.values() for step in arm}
 MINUTES |= {"collect": MT50.minutes["collect"], "collect_test": 4, "evaluate": 5}
