@@ -4,17 +4,17 @@
     python results/few_shot/few_shot.py --arms=frozen,scratch --demonstrations=1,5 --seeds=0
 
 A world model learns from ML45's 45 training tasks, and one policy from N demonstrations of each of its five test tasks,
-all on different positions. Policies are rolled out on 50 other positions of each task. The demonstrations of the
-training tasks are those of `lerobot-wm experiment --preset=mt50_hand`. A repeated command keeps what is finished and
-resumes the rest.
+all on different positions. Policies are rolled out on other positions of each task. The demonstrations are those of
+`lerobot-wm experiment --preset=mt50_hand`. A repeated command keeps what is finished and resumes the rest.
 """
 
 import argparse
 import json
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from lerobot.common.train_utils import get_step_checkpoint_dir
 from lerobot.configs.train import TRAIN_CONFIG_NAME
@@ -32,7 +32,6 @@ from lerobot_wm.report.arms import TRAININGS
 from lerobot_wm.system import usable_cores
 from lerobot_wm.train.resume import can_resume
 
-MOST_DEMONSTRATIONS = 25  # of a test task
 FULL_STATE = "full_state"  # the control that sees no image and is told where everything is
 MT50 = load_preset("mt50_hand")
 
@@ -46,14 +45,15 @@ class Step:
         flags: Of `lerobot-wm train`. {previous} is the checkpoint of the step before.
         steps: Of the training; 0 for `lerobot-wm init`, which trains nothing.
         minutes: It takes about so long, until one of its kind was measured.
-        is_pretraining: On the training tasks, with all their demonstrations; else on N of each test task.
+        data: All demonstrations of the training tasks, N of each test task, or these and a fifth as many of each
+            training task, at least one.
     """
 
     kind: str
     flags: str
     steps: int
     minutes: float
-    is_pretraining: bool = False
+    data: Literal["training tasks", "test tasks", "both"] = "test tasks"
 
 
 def policy_flags(settings: dict[str, Any], prefix: str = "policy") -> str:
@@ -76,7 +76,7 @@ ON_IMAGES = "--policy.random_crop_pad=4 --policy.lr_decay_share=0.5 --batch_size
 JOINTLY = f"{policy_flags(TRAININGS['joint_bc'])} --policy.world_model_path={{previous}} {ON_IMAGES}"
 FROM_IMAGES = f"--policy.type=e2e_bc {ON_IMAGES}"
 
-PRETRAINED = Step("pretrained", WORLD_MODEL, 20_000, 40, is_pretraining=True)
+PRETRAINED = Step("pretrained", WORLD_MODEL, 10_000, 20, "training tasks")
 UNTRAINED = Step("untrained", UNTRAINED_MODEL, 0, 0.3)
 POLICY = Step(
     "policy",
@@ -86,6 +86,9 @@ POLICY = Step(
 )
 JOINT = Step("joint", JOINTLY, 3_000, 6)
 JOINT_ON = Step("joint_on", f"--policy.path={{previous}} {ON_IMAGES}", 2_000, 5)
+TOGETHER = Step("together", JOINT_ON.flags, 4_000, 7, "both")
+ALL_JOINT = Step("all_joint", JOINTLY, 10_000, 15, "training tasks")
+ALL_SCRATCH = Step("all_scratch", FROM_IMAGES, 10_000, 15, "training tasks")
 # The policies of the test tasks, each the last of its steps.
 ARMS = {
     "frozen": [PRETRAINED, POLICY],
@@ -98,11 +101,14 @@ ARMS = {
     "joint_untrained": [UNTRAINED, JOINT],
     "policy": [
         PRETRAINED,
-        Step("all_tasks", ON_LATENTS, 40_000, 15, is_pretraining=True),
+        Step("all_tasks", ON_LATENTS, 40_000, 15, "training tasks"),
         Step("policy_on", f"--policy.path={{previous}} {BC}", 6_000, 2),
     ],
-    "policy_joint": [PRETRAINED, Step("all_joint", JOINTLY, 10_000, 15, is_pretraining=True), JOINT_ON],
-    "policy_scratch": [Step("all_scratch", FROM_IMAGES, 10_000, 15, is_pretraining=True), JOINT_ON],
+    "policy_joint": [PRETRAINED, ALL_JOINT, JOINT_ON],
+    "policy_scratch": [ALL_SCRATCH, JOINT_ON],
+    "together_joint": [PRETRAINED, ALL_JOINT, TOGETHER],
+    "together_scratch": [ALL_SCRATCH, TOGETHER],
+    "together_untrained": [replace(TOGETHER, kind="together_untrained", flags=FROM_IMAGES)],
     "demonstrations_only": [Step("world_model", WORLD_MODEL, 6_000, 12), POLICY],
     "scratch": [Step("scratch", FROM_IMAGES, 3_000, 6)],
     "backbone": [
@@ -114,35 +120,22 @@ ARMS = {
     FULL_STATE: [Step(FULL_STATE, f"{policy_flags(TRAININGS['state_bc'])} {BC}", 6_000, 1)],
 }
 MINUTES = {step.kind: step.minutes for arm in ARMS.values() for step in arm}
-MINUTES |= {"collect": MT50.minutes["collect"], "collect_test": 4, "evaluate": 5}
+MINUTES |= {"collect": MT50.minutes["collect"], "evaluate": 5}
 
 
-def few_demonstrations(output_dir: Path) -> Dataset:
-    """One demonstration of each test task on each of the first variations of set 42."""
-    few = replace(
-        MT50,
-        name="few_shot",
-        tasks="ml45_test",
-        episodes_per_task=MOST_DEMONSTRATIONS,
-        variations=f"0-{MOST_DEMONSTRATIONS - 1}",
-    )
-    collection = Plan(few, output_dir, MT50.variation_set).demonstrations()
-    # The other collection is twenty times as long.
-    return replace(collection, made_by=replace(collection.made_by, name="test_tasks", kind="collect_test"))
-
-
-def first_of_each(tasks: list[int], of_each: int, count: int) -> list[int]:
-    """The first `count` episodes of tasks, of a collection with `of_each` episodes of every task."""
-    return [task * of_each + episode for task in tasks for episode in range(count)]
-
-
-def pretraining_tasks(count: int) -> list[int]:
-    """Of ML45's training tasks, so many, by their places in MT50.
+def pretraining_tasks(count: int) -> list[str]:
+    """Of ML45's training tasks, so many.
 
     They are spread over the alphabet, in which tasks that resemble each other are neighbours.
     """
     ml45 = resolve_tasks("ml45")
-    return [all_tasks().index(ml45[i * len(ml45) // count]) for i in range(count)]
+    return [ml45[i * len(ml45) // count] for i in range(count)]
+
+
+def first_of_each(tasks: Iterable[str], count: int) -> list[int]:
+    """The first `count` episodes of each task in the preset's demonstrations, in ascending order."""
+    firsts = sorted(all_tasks().index(task) * MT50.episodes_per_task for task in tasks)
+    return [first + episode for first in firsts for episode in range(count)]
 
 
 @dataclass(frozen=True)
@@ -150,41 +143,48 @@ class Transfer:
     """Builds the stages of the arms.
 
     Args:
-        pretraining: The demonstrations of the training tasks.
+        demonstrations: Of all tasks.
         output_dir: Where everything else is written.
         n_tasks: How many of the 45 training tasks the world model sees.
         n_demonstrations: Of each test task.
         seed: Of all training.
         variation_set: That policies are rolled out on.
+        n_rollouts: Of each test task.
     """
 
-    pretraining: Dataset
+    demonstrations: Dataset
     output_dir: Path
     n_tasks: int
     n_demonstrations: int
     seed: int
     variation_set: int
+    n_rollouts: int
+
+    def tasks_seen(self, steps: list[Step]) -> int:
+        """How many of the training tasks were learned by these steps."""
+        return self.n_tasks if any(step.data != "test tasks" for step in steps) else 0
+
+    def episodes(self, step: Step) -> list[int]:
+        """What a step is trained on."""
+        training = pretraining_tasks(self.n_tasks)
+        if step.data == "training tasks":
+            return first_of_each(training, MT50.episodes_per_task)
+        of_old_tasks = max(1, self.n_demonstrations // 5) if step.data == "both" else 0
+        return first_of_each(ML45_TEST, self.n_demonstrations) + first_of_each(training, of_old_tasks)
 
     def checkpoint(self, steps: list[Step]) -> Checkpoint:
         """What the last of these steps makes."""
         *before, step = steps
         previous = self.checkpoint(before) if before else None
         kinds = "-".join(each.kind for each in steps)
-        seen = f"{self.n_tasks}_tasks" if steps[0].is_pretraining else "no_pretraining"
-        if step.is_pretraining:
-            data = self.pretraining
-            episodes = first_of_each(
-                pretraining_tasks(self.n_tasks), MT50.episodes_per_task, MT50.episodes_per_task
-            )
-        else:
-            data = few_demonstrations(self.output_dir)
-            episodes = first_of_each(list(range(len(ML45_TEST))), MOST_DEMONSTRATIONS, self.n_demonstrations)
-            seen += f"/{self.n_demonstrations}_demonstrations" if step.steps else ""
+        seen = f"{self.tasks_seen(steps)}_tasks"
+        if step.steps and step.data != "training tasks":
+            seen += f"/{self.n_demonstrations}_demonstrations"
         name = f"{seen}/{kinds}_{self.seed}"
         folder = self.output_dir / name
-        needs = (data.made_by, *([previous.made_by] if previous else []))
+        needs = (self.demonstrations.made_by, *([previous.made_by] if previous else []))
         flags = step.flags.format(previous=previous and previous.path).split()
-        settings = {**data.flags(), "seed": self.seed, "output_dir": folder}
+        settings = {**self.demonstrations.flags(), "seed": self.seed, "output_dir": folder}
         if not step.steps:
             path = folder / PRETRAINED_MODEL_DIR
             argv = lerobot_wm("init", settings, *flags)
@@ -192,7 +192,7 @@ class Transfer:
         settings |= {
             "steps": step.steps,
             "save_freq": 1000,
-            "dataset.episodes": f"[{','.join(map(str, episodes))}]",
+            "dataset.episodes": f"[{','.join(map(str, self.episodes(step)))}]",
             "policy.push_to_hub": "false",
             "policy.device": "cpu",
         }
@@ -212,9 +212,9 @@ class Transfer:
         return Checkpoint(stage, final / PRETRAINED_MODEL_DIR)
 
     def evaluation(self, arm: str) -> Stage:
-        """Rollouts on 50 positions of each test task, none of which has a demonstration."""
+        """Rollouts on positions without a demonstration, as many of each test task."""
         policy = self.checkpoint(ARMS[arm])
-        name = f"{policy.made_by.name}_eval_{self.variation_set}"
+        name = f"{policy.made_by.name}_eval_{self.variation_set}_{self.n_rollouts}"
         folder = self.output_dir / name
         flags = {
             "policy.path": policy.path,
@@ -224,11 +224,11 @@ class Transfer:
             "env.camera_name": MT50.camera_name,
             "env.episode_length": MT50.episode_length,
             "env.environment_state": str(arm == FULL_STATE).lower(),
-            "eval.n_episodes": 50,
+            "eval.n_episodes": self.n_rollouts,
             "videos_per_task": 2,
             "seed": 0,
             "output_dir": folder,
-            "arm": f"{arm}-{self.n_tasks if ARMS[arm][0].is_pretraining else 0}-{self.n_demonstrations}",
+            "arm": f"{arm}-{self.tasks_seen(ARMS[arm])}-{self.n_demonstrations}",
             "preset": "few_shot",
         }
         argv = lerobot_wm("eval", flags)
@@ -247,18 +247,21 @@ def main() -> None:
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--tasks", default="45", help="that the world model is pretrained on: 5,15,45")
     parser.add_argument("--variation_set", type=int, default=44, help="of rollouts: 43 to tune, 44 to report")
+    parser.add_argument("--rollouts", type=int, default=50, help="of each test task")
     parser.add_argument("--processes", type=int, default=usable_cores())
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/few_shot"))
     parser.add_argument("--list", action="store_true", help="only print the stages, and their minutes")
     arguments = parser.parse_args()
     output_dir: Path = arguments.output_dir
-    pretraining = Plan(MT50, output_dir.parent / MT50.name, MT50.variation_set).demonstrations()
+    data = Plan(MT50, output_dir.parent / MT50.name, MT50.variation_set).demonstrations()
     numbers = {
         name: [int(each) for each in vars(arguments)[name].split(",")]
         for name in ("tasks", "demonstrations", "seeds")
     }
     stages = [
-        Transfer(pretraining, output_dir, tasks, count, seed, arguments.variation_set).evaluation(arm)
+        Transfer(
+            data, output_dir, tasks, count, seed, arguments.variation_set, arguments.rollouts
+        ).evaluation(arm)
         for tasks in numbers["tasks"]
         for count in numbers["demonstrations"]
         for seed in numbers["seeds"]

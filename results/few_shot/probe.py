@@ -11,17 +11,18 @@ import argparse
 from pathlib import Path
 
 import torch
-from few_shot import MOST_DEMONSTRATIONS
+from few_shot import MT50, first_of_each
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor, nn
 
-from lerobot_wm.constants import OBS_STATE
+from lerobot_wm.constants import ML45_TEST, OBS_STATE
 from lerobot_wm.encode.episodes import Episode, read_episodes
 from lerobot_wm.nn.images import random_crop
 from lerobot_wm.nn.mlp import MLP
 from lerobot_wm.policies.latent.policy import load_encoder
 
 SHIFTS, STEPS, BATCH = 16, 4000, 256
+DEMONSTRATIONS = 25  # of each task, learned from or tested on
 
 
 @torch.no_grad()
@@ -41,7 +42,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("world_model")
-    parser.add_argument("--dataset", type=Path, default=Path("outputs/few_shot/dataset"))
+    parser.add_argument("--dataset", type=Path, default=Path("outputs/mt50_hand/dataset"))
     parser.add_argument(
         "--demonstrations", type=int, default=5, help="of each task that the head learns from"
     )
@@ -53,10 +54,11 @@ def main() -> None:
 
     policy = load_encoder(arguments.world_model)
     model = policy.world_model.eval()
-    data = LeRobotDataset("local/few_shot_dataset", root=arguments.dataset)
+    chosen = first_of_each(ML45_TEST, DEMONSTRATIONS)
+    data = LeRobotDataset("local/mt50_hand_dataset", root=arguments.dataset, episodes=chosen)
     episodes = read_episodes(data, policy.config.cameras, policy.config.image_size, columns=[OBS_STATE])
     tasks = list(dict.fromkeys(episode.task for episode in episodes))
-    position = [episode.index % MOST_DEMONSTRATIONS for episode in episodes]
+    position = [episode.index % MT50.episodes_per_task for episode in episodes]
     few = [each for each, i in zip(episodes, position, strict=True) if i < arguments.demonstrations]
     others = [each for each, i in zip(episodes, position, strict=True) if i >= arguments.demonstrations]
 
