@@ -1,6 +1,6 @@
 """The tables and the figure of few-shot transfer, from the records of few_shot.py.
 
-    python results/few_shot/curves.py 'outputs/few_shot/**/*_eval_44/records.jsonl'
+    python results/few_shot/curves.py 'outputs/few_shot/**/*_eval_44_50/records.jsonl'
     python results/few_shot/curves.py results/few_shot/records.jsonl.gz
 
 The names of arms are ARM-TASKS-DEMONSTRATIONS: the tasks of pretraining, 0 where there was none, and the demonstrations
